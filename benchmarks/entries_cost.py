@@ -257,6 +257,23 @@ def legged(quick: bool) -> list[Metric]:
     return metrics
 
 
+@entry("floor_scenes", MUJOCO)
+def floor_scenes(quick: bool) -> list[Metric]:
+    """Lets boxes and a leg with a closed loop fall on a floor: rates relative to MuJoCo C."""
+    from benchmarks import floor_scenes as study
+
+    metrics, batch = [], 16 if quick else 128
+    for name in ("leg",) if quick else study.SCENES:
+        found, compiling, failed = study.rate_here(name, batch)
+        metrics.append(rate(f"{name}, world-steps", found.median))
+        metrics.append(seconds(f"{name}, compile", compiling))
+        metrics.append(count(f"{name}, failed", float(failed)))
+        if not quick:
+            times = found.median / study.rate_of_mujoco(name, batch).median
+            metrics.append(Metric(f"{name}, over MuJoCo C", times))
+    return metrics
+
+
 @entry("needed")
 def needed(quick: bool) -> list[Metric]:
     """Counts operations and instructions of a step, from a particle to a humanoid."""

@@ -558,20 +558,26 @@ def test_worlds_that_two_groups_of_lanes_have_step_once(worlds):
 @pytest.fixture
 def folder(tmp_path):
     """A folder for compiled programs, in place of that of other tests."""
-    before = jax.config.values["jax_compilation_cache_dir"]
-    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    names = "jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs"
+    before = {name: jax.config.values[name] for name in names}
+    for name, value in zip(names, (str(tmp_path), 0.0), strict=True):
+        jax.config.update(name, value)
     yield tmp_path
-    jax.config.update("jax_compilation_cache_dir", before)
+    for name, value in before.items():
+        jax.config.update(name, value)
 
 
 def test_machine_code_is_kept_beside_the_programs_of_jax(folder):
-    assert cpu.kept("name", lambda: b"code") == b"code"
-    assert cpu.kept("name", lambda: b"other") == b"code"
+    assert cpu.stored_code("name", lambda: b"code") == b"code"
+    assert cpu.stored_code("name", lambda: b"other") == b"code"
     (file,) = folder.iterdir()
     file.write_bytes(file.read_bytes()[:-1])  # as after a full disk
-    assert cpu.kept("name", lambda: b"again") == b"again"
+    assert cpu.stored_code("name", lambda: b"again") == b"again"
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 60.0)
+    assert cpu.stored_code("quick", lambda: b"code") == b"code"
+    assert cpu.stored_code("quick", lambda: b"other") == b"other"
     jax.config.update("jax_compilation_cache_dir", None)
-    assert cpu.kept("name", lambda: b"other") == b"other"
+    assert cpu.stored_code("name", lambda: b"other") == b"other"
 
 
 def test_long_programs_have_memory_of_their_own(monkeypatch):
@@ -583,6 +589,49 @@ def test_long_programs_have_memory_of_their_own(monkeypatch):
     program = jax.jit(jax.vmap(lambda s: step(s)))
     assert "xui8>" in program.lower(states).as_text()
     assert_close(program(states), by_xla(jax.vmap(step), states), 1e-5)
+
+
+def counted_down(x: Any) -> Any:
+    """Ends for whole numbers only, such as arguments, and not for results."""
+    end = lambda y: jax.lax.while_loop(lambda z: z != 0, lambda z: z - 1, y)  # noqa: E731
+    return jax.vmap(end)(x.reshape(-1)).reshape(x.shape) - 0.5
+
+
+@pytest.mark.parametrize("worlds", [1, 16, 17, 35])
+def test_worlds_do_not_wait_for_worlds_that_are_done(worlds):
+    x = jnp.arange(1.0, worlds + 1)
+    mapped = jax.vmap(lambda x: batch_last.call(counted_down, x))
+    np.testing.assert_array_equal(jax.jit(mapped)(x), -0.5)
+
+
+def test_loops_over_the_rows_of_rows(platform):
+    """Only the inner loop reads from memory."""
+
+    def total(x: Any) -> Any:
+        row = lambda c, r: (jax.lax.scan(lambda c, y: (0.5 * c + y, None), c, r)[0], None)  # noqa: E731
+        return jax.lax.scan(row, 0.0, x)[0]
+
+    x = np.random.default_rng(0).standard_normal((66, 70)).astype(np.float32)
+    np.testing.assert_allclose(*evaluated(platform, total, x), *expected(total, x), rtol=1e-5)
+
+
+def test_results_of_other_dtypes_are_left_to_xla():
+    x = jnp.ones((4, 3))
+    both = lambda x: (x + 1, jnp.full(x.shape, 3, jnp.int8))  # noqa: E731
+    pair = jax.vmap(lambda x: batch_last.call(both, x))
+    assert pair(x)[1].dtype == np.int8
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_angles_without_a_sine_have_none(platform, dtype):
+    with jax.enable_x64(dtype == np.float64):
+        (here,) = evaluated(platform, jnp.sin, np.array([1e15, 1e16, 1e30], dtype))
+        assert list(np.isnan(here)) == [False, True, True]
+
+
+def test_a_result_without_the_axis_of_worlds_is_an_error():
+    with pytest.raises(ValueError, match="without the axis of its worlds"):
+        batch_last.call(lambda x: (x + 1, jnp.arange(3)), jnp.ones(2))
 
 
 def lowered(function: Callable[..., Any], *args: Any) -> str:

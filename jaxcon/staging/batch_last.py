@@ -143,7 +143,6 @@ class Native:
         self.transposed = functools.lru_cache(maxsize=64)(functools.partial(TransposedNative, self))
         self.part = functools.lru_cache(maxsize=64)(functools.partial(PartialNative, self))
         self.among = functools.lru_cache(maxsize=64)(self._among)
-        self._pruned: dict[ClosedJaxpr, ClosedJaxpr] = {}
 
     def __call__(self, *args: Array) -> list[Array]:
         """Calls the wrapped function directly, not through the primitive; returns its results."""
@@ -183,6 +182,8 @@ class Native:
             rank: the number of batch axes.
         """
         closed = self.traced(*(((*x.shape[: x.ndim - rank], 1), x.dtype) for x in args))
+        if any(y.shape[-1:] != (1,) for y in closed.out_avals):
+            raise ValueError("a native function returns an array without the axis of its worlds.")
         batches = [x.shape[x.ndim - rank :] for x in args]
         shared = (1,) * rank
         return [
@@ -203,10 +204,7 @@ class Native:
 
     def pruned(self, *avals: Aval) -> ClosedJaxpr:
         """Returns the closed jaxpr without unused equations, from a cache."""
-        closed = self.traced(*avals)
-        if closed not in self._pruned:
-            self._pruned[closed] = ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
-        return self._pruned[closed]
+        return pruned(self.traced(*avals))
 
     def _among(self, settings: tuple[Any, ...], *avals: Aval) -> ClosedJaxpr:
         """Returns `_traced(*avals)`, and is cached by settings, shapes and dtypes.
@@ -233,6 +231,12 @@ class Native:
                 " params= instead."
             )
         return closed
+
+
+@functools.lru_cache(maxsize=256)
+def pruned(closed: ClosedJaxpr) -> ClosedJaxpr:
+    """Returns a closed jaxpr without unused equations."""
+    return ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
 
 
 @functools.lru_cache(maxsize=256)

@@ -13,6 +13,7 @@ import functools
 import hashlib
 import os
 import threading
+import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -47,7 +48,7 @@ class Cpu:
 
 
 def _size(program: Sequence[Statement]) -> int:
-    """Returns the bytes of most numbers that a program reads."""
+    """Returns the median size of the floats that a program reads; 4 if it reads none."""
     loads = [x for x in program if isinstance(x, Instruction) and x.name == "load"]
     sizes = [x.result.dtype.itemsize for x in loads if x.result and x.result.dtype.kind == "f"]
     return int(np.median(sizes)) if sizes else 4
@@ -92,11 +93,15 @@ class _Compiler:
     """
 
     def __init__(self) -> None:
-        self._engine = llvmlite.binding.create_mcjit_compiler(
-            llvmlite.binding.parse_assembly(""), _machine()
-        )
         self._names: set[str] = set()
         self._lock = threading.Lock()
+
+    @functools.cached_property
+    def _engine(self) -> Any:
+        """The memory of all machine code, from the first kernel on."""
+        return llvmlite.binding.create_mcjit_compiler(
+            llvmlite.binding.parse_assembly(""), _machine()
+        )
 
     def target(self, text: str) -> str:
         """Returns the name by which XLA calls a kernel; compiles it if it is new."""
@@ -108,7 +113,9 @@ class _Compiler:
         return name
 
     def _register(self, name: str, text: str) -> None:
-        code = kept(name, lambda: _machine().emit_object(llvmlite.binding.parse_assembly(text)))
+        code = stored_code(
+            name, lambda: _machine().emit_object(llvmlite.binding.parse_assembly(text))
+        )
         self._engine.add_object_file(llvmlite.binding.ObjectFileRef.from_data(code))
         self._engine.finalize_object()
         address = self._engine.get_function_address(name)
@@ -116,15 +123,21 @@ class _Compiler:
         jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
 
 
-def kept(name: str, compiled: Callable[[], bytes]) -> bytes:
+COMPILER = _Compiler()
+
+
+def stored_code(name: str, compiled: Callable[[], bytes]) -> bytes:
     """Returns machine code from JAX's folder of compiled programs; compiles and stores new code.
+
+    As for programs, code that is compiled quickly is not stored.
 
     Args:
         name: the name of the kernel.
         compiled: returns the machine code.
     """
-    folder = jax.config.values["jax_compilation_cache_dir"]
-    if not (folder and jax.config.values["jax_enable_compilation_cache"]) or "://" in folder:
+    settings = jax.config.values
+    folder = settings["jax_compilation_cache_dir"]
+    if not (folder and settings["jax_enable_compilation_cache"]) or "://" in folder:
         return compiled()
     path = Path(folder) / f"{name}-{_processor()}.o"
     size = hashlib.sha256().digest_size
@@ -132,7 +145,10 @@ def kept(name: str, compiled: Callable[[], bytes]) -> bytes:
         stored = path.read_bytes()
         if hashlib.sha256(stored[size:]).digest() == stored[:size]:
             return stored[size:]
+    start = time.perf_counter()
     code = compiled()
+    if time.perf_counter() - start < settings["jax_persistent_cache_min_compile_time_secs"]:
+        return code
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         part = path.with_suffix(f".{os.getpid()}")
@@ -153,11 +169,6 @@ def _processor() -> str:
     return hashlib.sha256(" ".join(parts).encode()).hexdigest()[:16]
 
 
-@functools.cache
-def _compiler() -> _Compiler:
-    return _Compiler()
-
-
 def _lowered(
     ctx: mlir.LoweringRuleContext,
     *args: Any,
@@ -171,7 +182,7 @@ def _lowered(
     if size := llvm.scratch(text):
         results.append(ShapedArray((size,), np.dtype(np.uint8)))
     call = jax.ffi.ffi_lowering(
-        _compiler().target(text),
+        COMPILER.target(text),
         operand_layouts=list(map(batch_last, ctx.avals_in)),
         result_layouts=list(map(batch_last, results)),
         operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},

@@ -2,7 +2,7 @@
 
 Numbers are reduced to a small range in 64 bits, where a power series is short. The errors are a few
 roundings: within 3e-7 of the result or of 1, whichever is larger, in float32, and 1e-15 in float64.
-For angles, the error grows beyond 1e9 rad.
+For angles, the error grows beyond 1e9 rad, and sine and cosine are NaN beyond 3e15 rad.
 
 Reference: Muller, Elementary Functions (2016), chapters 11 and 12.
 """
@@ -25,6 +25,9 @@ LOG_2 = (0.6931471804855391, 7.440617110012397e-11)
 SHIFT = np.float64(1.5 * 2.0**52)
 """A number whose sum with an integer of less than 2⁵¹ has no bits for a fraction."""
 
+LARGEST_ANGLE = 3e15
+"""The largest angle whose sine and cosine are numbers [rad]."""
+
 TERMS = {"float32": 5, "float64": 9}
 """The number of terms of the series of sine and cosine, for angles up to π/4."""
 
@@ -46,6 +49,8 @@ def _quarter_turns(thread: Thread, x: Scalar) -> tuple[Scalar, Scalar]:
     rest: Scalar = wide
     for part in HALF_PI:
         rest = thread.fma(back, np.float64(part), rest)
+    small = thread.apply("lt", thread.apply("abs", wide), np.float64(LARGEST_ANGLE))
+    rest = thread.select(small, rest, np.float64(np.nan))
     return thread.convert(rest, x.dtype), bits
 
 

@@ -402,8 +402,10 @@ class Evaluation:
         for k in reversed(order) if params["reverse"] else order:
             # indices that count rounds are known numbers if the loop is written round by round
             most = MAX_UNROLLED // length if repeats and k == 0 else None
+            extra = self._extra
             both = self.thread.tried(lambda k=k: one(k), most)
             if both is None:
+                self._extra = extra
                 return self._repeat(body, fixed, carried, rows, places, length)
             carried = both[:carries]
             results.append(both[carries:])

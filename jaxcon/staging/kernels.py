@@ -141,11 +141,14 @@ def _spread(call: Callable[..., list[Array]], rank: int) -> Callable[..., list[A
 
     def partition(mesh: Mesh, args: Sequence[Any], results: Sequence[Any]) -> Any:
         named: list[Any] = [None] * rank
+        used: set[str] = set()
         for x in (*results, *args):
             spec = (*x.sharding.spec, *(None,) * len(x.shape))
             for axis, name in zip(axes(x.shape), spec, strict=False):
-                if axis is not None and name is not None and name not in named:
-                    named[axis] = named[axis] or name
+                parts = {name} if isinstance(name, str) else set(name or ())
+                if axis is not None and named[axis] is None and parts and not parts & used:
+                    named[axis] = name
+                    used |= parts
 
         def placed(x: Any) -> NamedSharding:
             spec = (None if axis is None else named[axis] for axis in axes(x.shape))

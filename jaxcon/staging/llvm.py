@@ -38,7 +38,7 @@ from jaxcon.staging.thread import (
     Statement,
     inner,
     is_float,
-    moved_by,
+    pointers_of,
 )
 
 KINDS = {"float32": "float", "float64": "double", "int32": "i32", "int64": "i64", "uint32": "i32"}
@@ -73,15 +73,19 @@ MAX_STACK = 65_536
 """The most bytes of places on the stack, whose size in XLA's threads is not known."""
 
 SCRATCH = "; bytes of memory: "
-LINE = 64
-"""The bytes of a line of the cache. Addresses of places are multiples of it."""
+LINE = 128
+"""The bytes of the largest vector, to a multiple of which places are aligned."""
 
 FRAME = {"extension": 8, "api": 16, "arguments": 72, "results": 112}
 """The offsets of fields in the description of a call, in bytes."""
 
-API_VERSION, METADATA, METADATA_VERSION, METADATA_TRAITS, DATA = 32, 24, 24, 32, 24
-"""Offsets of fields: the version in the description of XLA's interface; the metadata in a request
-for it; the version and the traits in the metadata; the address of the numbers of an array."""
+API_VERSION, KIND, METADATA, METADATA_VERSION, METADATA_TRAITS, DATA = 32, 8, 24, 24, 32, 24
+"""Offsets of fields: the version in the description of XLA's interface; the kind of a request, and
+the metadata in a request for it; the version and the traits in the metadata; the address of the
+numbers of an array."""
+
+IS_METADATA = 1
+"""The kind of a request for metadata."""
 
 
 def text(
@@ -256,7 +260,6 @@ class _Writer:
         self._block = "entry"
         self._pointers: dict[tuple[int, tuple[tuple[Counter, int], ...]], str] = {}
         self._mask: str | None = None  # the lanes that take part; None for all
-        self._fresh: str | None = None  # the lanes whose worlds are new; None for all
         self._read: dict[int, str] = {}  # values of places, in the current piece
 
     def _new(self) -> str:
@@ -324,6 +327,10 @@ class _Writer:
                 self._line(f"%{kind}s = alloca {every}, align {LINE}")
         extension = self._field("%frame", FRAME["extension"])
         asked = self._result(f"icmp ne ptr {extension}, null")
+        self._line(f"br i1 {asked}, label %extended, label %arrays")
+        self._label("extended")
+        kind = self._field(extension, KIND, "i32")
+        asked = self._result(f"icmp eq i32 {kind}, {IS_METADATA}")
         self._line(f"br i1 {asked}, label %metadata, label %arrays")
         self._label("metadata")
         api = self._field("%frame", FRAME["api"])
@@ -362,13 +369,14 @@ class _Writer:
         beyond = self._result(f"icmp sgt i64 %begun, {last}")
         first = self._result(f"select i1 {beyond}, i64 {last}, i64 %begun")
         if worlds % self.lanes:
-            # of worlds that two groups have, the second one may find results in place of arguments
-            self._fresh = "%fresh"
+            # worlds that two groups have take part in the first one only: the second one may find
+            # results in place of their arguments
+            self._mask = "%fresh"
             index = self._vector("i64")
             numbers = ", ".join(f"i64 {k}" for k in range(self.lanes))
             done = self._result(f"sub i64 %begun, {first}")
             done = self._result(f"insertelement {index} poison, i64 {done}, i32 0")
-            done = self._result(self._repeated(index, done))
+            done = self._result(self._splat(index, done))
             self._line(f"%fresh = icmp uge {index} <{numbers}>, {done}")
         for k, array in enumerate(self.arrays):
             if array.world:
@@ -408,11 +416,10 @@ class _Writer:
             *(self._pointers[x] for x in sorted(used)),
         ]
         names = {x.name for x in piece.instructions}
-        masks = [self._fresh] if "store" in names else []
-        masks += [self._mask] if names & {"store", "assign"} else []
         count = len(self.places.count)  # places lie apart from each other and from all arrays
         arguments = [f"ptr {'noalias ' if k < count else ''}{x}" for k, x in enumerate(pointers)]
-        arguments += [f"{self._vector('i1')} {x}" for x in masks if x]
+        if self._mask and names & {"store", "assign"}:
+            arguments.append(f"{self._vector('i1')} {self._mask}")
         given = ", ".join(arguments)
         name = f"@piece{next(self._count)}"
         outside, self.lines = self.lines, []
@@ -499,7 +506,7 @@ class _Writer:
         self._line(f"br label %{label}")
         self._label(label)
         self._line(f"{counter} = phi i64 [0, %{entered}], [{following}, %{label}r]")
-        for array, _, moves in moved_by(repeat.counter, repeat.body):
+        for array, _, moves in pointers_of(repeat.counter, repeat.body):
             *others, (_, entries) = moves
             stride = entries * self.arrays[array].entry
             far = self._result(f"mul i64 {counter}, {stride}")
@@ -526,7 +533,7 @@ class _Writer:
         if not self.arrays[address.array].world and self.lanes > 1:
             one = self._result(f"load {stored}, ptr {place}")
             one = self._result(f"insertelement {whole} poison, {stored} {one}, i32 0")
-            read = self._repeated(whole, one)
+            read = self._splat(whole, one)
         else:
             read = f"load {whole}, ptr {place}, align {result.dtype.itemsize}"
         if kind == "i1":
@@ -534,7 +541,7 @@ class _Writer:
             read = f"icmp ne {whole} {self._result(read)}, {zero}"
         self._line(f"{name} = {read}")
 
-    def _repeated(self, kind: str, x: str) -> str:
+    def _splat(self, kind: str, x: str) -> str:
         """Returns the first number of a vector in all lanes."""
         first = f"<{self.lanes} x i32> zeroinitializer"
         return f"shufflevector {kind} {x}, {kind} poison, {first}"
@@ -544,10 +551,9 @@ class _Writer:
         if x.dtype == bool:
             kind, bits = self._vector("i8"), kind
             value = self._result(f"zext {bits} {value} to {kind}")
-        for mask in filter(None, (self._mask, self._fresh)):
-            if self.lanes > 1:
-                before = self._result(f"load {kind}, ptr {place}, align {x.dtype.itemsize}")
-                value = self._selected(mask, kind, value, before)
+        if self._mask is not None and self.lanes > 1:
+            before = self._result(f"load {kind}, ptr {place}, align {x.dtype.itemsize}")
+            value = self._selected(self._mask, kind, value, before)
         self._line(f"store {kind} {value}, ptr {place}, align {x.dtype.itemsize}")
 
     def _selected(self, mask: str, kind: str, x: str, y: str) -> str:

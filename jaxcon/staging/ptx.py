@@ -25,7 +25,7 @@ from jaxcon.staging.thread import (
     Scalar,
     Statement,
     is_float,
-    moved_by,
+    pointers_of,
 )
 
 HEADER = ".version 7.0\n.target sm_70\n.address_size 64\n"
@@ -173,7 +173,7 @@ class _Writer:
         ends = self._new("pred")
         self._line("mov.u32", counter, "0")
         self.lines.append(f"{label}:")
-        for array, _, moves in moved_by(repeat.counter, repeat.body):
+        for array, _, moves in pointers_of(repeat.counter, repeat.body):
             *before, (_, entries) = moves
             stride = entries * self.arrays[array].entry
             pointer = self._pointers[array, moves] = self._new("u64")

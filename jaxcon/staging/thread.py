@@ -193,8 +193,7 @@ class Thread:
             UnsupportedError: registers have no such dtype.
         """
         dtype = np.dtype(dtype)
-        if dtype not in DTYPES:
-            raise UnsupportedError(f"numbers of dtype {dtype.name}")
+        _check(dtype)
         number = next(self._count)
         if number > MAX_REGISTERS:
             raise UnsupportedError(f"more than {MAX_REGISTERS} registers")
@@ -225,14 +224,19 @@ class Thread:
     def load(self, address: Address, dtype: Any) -> Register:
         """Reads a number from memory; a bool from a byte.
 
-        All numbers must be read before any is written, since arrays may share memory.
+        If an argument lends its memory to a result, all numbers must be read before any is written.
         """
         result = self.new(dtype)
         self._append(Instruction("load", result, (), (), address))
         return result
 
     def store(self, address: Address, x: Scalar) -> None:
-        """Writes a number to memory; a bool as a byte."""
+        """Writes a number to memory; a bool as a byte.
+
+        Raises:
+            UnsupportedError: registers have no such dtype.
+        """
+        _check(x.dtype)
         self._append(Instruction("store", None, (x,), _numbers((x,)), address))
 
     def copied(self, x: Scalar) -> Register:
@@ -332,6 +336,7 @@ class Thread:
                 results.append(a)
                 continue
             result = self.new(a.dtype)
+            self.length += 2
             first.append(Instruction("set", None, (result, a), _numbers((a,))))
             second.append(Instruction("assign", None, (result, b), _numbers((b,))))
             results.append(result)
@@ -450,6 +455,12 @@ def _written(statements: Sequence[Statement], read: set[int]) -> list[Statement]
 
     change = functools.partial(_written, read=read)
     return [inner(x, change) for x in statements if is_needed(x)]
+
+
+def _check(dtype: np.dtype) -> None:
+    """Raises an `UnsupportedError` if registers have no such dtype."""
+    if dtype not in DTYPES:
+        raise UnsupportedError(f"numbers of dtype {dtype.name}")
 
 
 def _used(statements: Sequence[Statement], read: set[int]) -> list[Statement]:
@@ -601,10 +612,17 @@ def addresses(statements: Sequence[Statement]) -> list[Address]:
     return found
 
 
-def moved_by(counter: Counter, statements: Sequence[Statement]) -> list[Address]:
-    """Returns the addresses in the body of a loop whose last move is that of its counter, once."""
-    inside = (x._replace(entry=0) for x in addresses(statements) if x.moves)
-    return sorted({x for x in inside if x.moves[-1][0] == counter})
+def pointers_of(counter: Counter, body: Sequence[Statement]) -> list[Address]:
+    """Returns the places that the body of a loop starts from, once; their last move is the loop's.
+
+    Loops within the body go on from these places.
+    """
+    found: set[Address] = set()
+    for array, _, moves in addresses(body):
+        for k, (mover, _) in enumerate(moves, 1):
+            if mover == counter:
+                found.add(Address(array, 0, moves[:k]))
+    return sorted(found)
 
 
 def is_same(x: Scalar, y: Scalar) -> bool:
@@ -720,7 +738,7 @@ def _clamp(thread: Thread, low: Scalar, x: Scalar, high: Scalar) -> Scalar:
 
 
 def _shift(name: str) -> Callable[..., Scalar]:
-    """Makes a shift of bits by a known number less than 32."""
+    """Makes a shift by a known number of bits, less than the dtype has."""
 
     def write(thread: Thread, x: Scalar, by: Scalar) -> Scalar:
         if isinstance(by, Register) or not 0 <= int(by) < 8 * x.dtype.itemsize:
