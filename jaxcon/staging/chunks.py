@@ -106,16 +106,8 @@ class OneWorld:
 
     def _differ(self, mapped: Flags) -> Flags:
         """Returns a flag for each result: True if it depends on an argument that is mapped."""
-        jaxpr = self.closed.jaxpr
-        known = {x for x, flag in zip(jaxpr.invars, mapped, strict=True) if flag}
-
-        def differs(x: Any) -> bool:
-            return not isinstance(x, Literal) and x in known
-
-        for equation in jaxpr.eqns:
-            if any(map(differs, equation.invars)):
-                known.update(equation.outvars)
-        return tuple(map(differs, jaxpr.outvars))
+        every = batch_last.sources_of(self.closed)
+        return tuple(any(mapped[i] for i in sources) for sources in every)
 
     def _moving(self, moved: Flags, args: Sequence[Array]) -> Callable[..., Any]:
         """Returns the function of the arguments whose flag in `moved` is True.

@@ -25,7 +25,7 @@ from jax.core import ShapedArray
 from jax.interpreters import mlir
 
 from jaxcon.staging import llvm
-from jaxcon.staging.kernels import NAME, batch_last, kernel_p, shared_memory
+from jaxcon.staging.kernels import NAME, called, kernel_p
 from jaxcon.staging.thread import Instruction, Layout, Statement
 
 OPTIMIZATION = 1
@@ -181,13 +181,7 @@ def _lowered(
     results = list(ctx.avals_out)
     if size := llvm.scratch(text):
         results.append(ShapedArray((size,), np.dtype(np.uint8)))
-    call = jax.ffi.ffi_lowering(
-        COMPILER.target(text),
-        operand_layouts=list(map(batch_last, ctx.avals_in)),
-        result_layouts=list(map(batch_last, results)),
-        operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},
-    )
-    return list(call(ctx.replace(avals_out=results), *args))[: len(shapes)]
+    return list(called(ctx, args, COMPILER.target(text), results, in_place))[: len(shapes)]
 
 
 mlir.register_lowering(kernel_p, _lowered, platform="cpu")

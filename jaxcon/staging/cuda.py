@@ -10,11 +10,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 from jax.interpreters import mlir
 
 from jaxcon.staging import ptx
-from jaxcon.staging.kernels import NAME, batch_last, kernel_p, shared_memory
+from jaxcon.staging.kernels import NAME, called, kernel_p
 from jaxcon.staging.ptx import BLOCK
 from jaxcon.staging.thread import Layout, Statement
 
@@ -63,14 +62,7 @@ def _lowered(
     config |= {"shared_mem_bytes": integer(0)}
     last = range(len(args), len(args) + len(shapes))
     config |= {"output_indices": mlir.ir.ArrayAttr.get(list(map(integer, last)))}
-    call = jax.ffi.ffi_lowering(
-        TARGET,
-        operand_layouts=list(map(batch_last, ctx.avals_in)),
-        result_layouts=list(map(batch_last, ctx.avals_out)),
-        operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},
-        backend_config=config,
-    )
-    return call(ctx, *args)
+    return called(ctx, args, TARGET, ctx.avals_out, in_place, backend_config=config)
 
 
 mlir.register_lowering(kernel_p, _lowered, platform="cuda")

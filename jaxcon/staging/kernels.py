@@ -115,11 +115,9 @@ def _call(platform: Platform, fun: Native, rank: int, *args: Array) -> list[Arra
     batch = batch_of(args, rank)
     flat = [_merged(x, batch) for x in args]
     worlds = math.prod(batch)
-    one = [jax.ShapeDtypeStruct((*x.shape[:-1], 1), x.dtype) for x in flat]
+    one = fun.without_batch().pruned(*(((*x.shape[:-1], 1), x.dtype) for x in flat))
     own = tuple(worlds > 1 and x.shape[-1] == worlds for x in flat)
-    text, shapes = _kernel(
-        platform, fun.without_batch().pruned(*((x.shape, x.dtype) for x in one)), own, worlds
-    )
+    text, shapes = _kernel(platform, one, own, worlds)
     shapes = tuple(((*shape[:-2], worlds), dtype) for shape, dtype in shapes)
     results = kernel_p.bind(*flat, text=text, shapes=shapes, worlds=worlds, in_place=True)
     return [y.reshape((*y.shape[:-1], *batch)) for y in results]
@@ -273,6 +271,34 @@ def _abstract(
 ) -> list[ShapedArray]:
     """The abstract evaluation rule: returns the shapes and dtypes of the results."""
     return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+
+
+def called(
+    ctx: mlir.LoweringRuleContext,
+    args: Sequence[Any],
+    target: str,
+    results: Sequence[Any],
+    in_place: bool,
+    **options: Any,
+) -> Sequence[Any]:
+    """Writes XLA's call of a kernel, whose arrays lie in memory with the batch last.
+
+    Args:
+        ctx: the lowering context of `kernel_p`.
+        args: the arguments.
+        target: the name by which XLA knows what to call.
+        results: the types of the results: those of `kernel_p`, and others after them.
+        in_place: True if arguments may lend their memory to results of `kernel_p`.
+        options: further options of `jax.ffi.ffi_lowering`.
+    """
+    call = jax.ffi.ffi_lowering(
+        target,
+        operand_layouts=list(map(batch_last, ctx.avals_in)),
+        result_layouts=list(map(batch_last, results)),
+        operand_output_aliases=shared_memory(ctx.avals_in, ctx.avals_out) if in_place else {},
+        **options,
+    )
+    return call(ctx.replace(avals_out=results), *args)
 
 
 def shared_memory(args: Sequence[Any], results: Sequence[Any]) -> dict[int, int]:

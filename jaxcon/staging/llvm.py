@@ -64,7 +64,7 @@ PIECE = 300
 """The number of instructions of a piece."""
 
 WRITE = 5
-"""How many instructions one counts for that writes to a register which others keep in memory."""
+"""The weight of a `set` or an `assign` in the length of a piece; other instructions have 1."""
 
 FEW = 50
 """The fewest instructions that are a function of their own."""
@@ -186,7 +186,7 @@ class _Places:
         self._position += 1
         for x in instruction.operands:
             self._use(x)
-        if instruction.name in ("set", "assign"):
+        if instruction.name in WRITES:
             register: Any = instruction.operands[0]
             self._shared[register.number] = register
         elif instruction.result is not None:

@@ -645,26 +645,19 @@ def _plain(name: str) -> Callable[..., Scalar]:
     return lambda thread, *operands: thread.emit(name, operands[0].dtype, *operands)
 
 
-def _of_floats(name: str) -> Callable[..., Scalar]:
-    """Makes an operation of one instruction on floats."""
+def _of(kinds: str, name: str) -> Callable[..., Scalar]:
+    """Makes an operation of one instruction on numbers whose dtypes are of the given kinds."""
 
     def write(thread: Thread, *operands: Scalar) -> Scalar:
-        if not is_float(operands[0]):
+        if operands[0].dtype.kind not in kinds:
             raise UnsupportedError(f"{name} of {operands[0].dtype.name}")
         return thread.emit(name, operands[0].dtype, *operands)
 
     return write
 
 
-def _signed(name: str) -> Callable[..., Scalar]:
-    """Makes an operation of one instruction on numbers that have a sign."""
-
-    def write(thread: Thread, *operands: Scalar) -> Scalar:
-        if operands[0].dtype.kind == "u":
-            raise UnsupportedError(f"{name} of {operands[0].dtype.name}")
-        return thread.emit(name, operands[0].dtype, *operands)
-
-    return write
+FLOATS, SIGNED = "f", "bif"
+"""Kinds of dtypes: floats, and all but unsigned integers."""
 
 
 def _compare(name: str) -> Callable[..., Scalar]:
@@ -743,7 +736,7 @@ def _shift(name: str) -> Callable[..., Scalar]:
     def write(thread: Thread, x: Scalar, by: Scalar) -> Scalar:
         if isinstance(by, Register) or not 0 <= int(by) < 8 * x.dtype.itemsize:
             raise UnsupportedError(f"{name} by a traced number")
-        return _signed(name)(thread, x, by)
+        return _of(SIGNED, name)(thread, x, by)
 
     return write
 
@@ -755,13 +748,13 @@ INSTRUCTIONS: dict[str, Callable[..., Scalar]] = {
     "mul": _plain("mul"),
     "div": _quotient("div"),
     "rem": _quotient("rem"),
-    "neg": _signed("neg"),
-    "abs": _signed("abs"),
+    "neg": _of(SIGNED, "neg"),
+    "abs": _of(SIGNED, "abs"),
     "square": lambda thread, x: thread.apply("mul", x, x),
-    "sqrt": _of_floats("sqrt"),
+    "sqrt": _of(FLOATS, "sqrt"),
     "rsqrt": _rsqrt,
-    "floor": _of_floats("floor"),
-    "ceil": _of_floats("ceil"),
+    "floor": _of(FLOATS, "floor"),
+    "ceil": _of(FLOATS, "ceil"),
     "max": _extremum("max"),
     "min": _extremum("min"),
     "clamp": _clamp,
