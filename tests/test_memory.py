@@ -72,8 +72,8 @@ def test_a_rollout_takes_what_a_step_takes():
     told = jax.eval_shape(lambda s: jc.step(system, method, s, None, 2e-3)[1], state)
     told = sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(told))
     assert 0.7 < (given + other) / (memory.of(400) - 400 * told) < 1 + CLOSE
-    # a CPU steps some worlds at a time: more of them need less
-    assert sum(planned(run, state, 4000)) < 0.7 * (memory.of(4000) - 4000 * told)
+    # a CPU steps some worlds at a time: more of them need less each
+    assert sum(planned(run, state, 4000)) / 4000 < 0.85 * (given + other) / 400
 
 
 def test_a_report_has_it_where_a_method_is_given():

@@ -219,12 +219,11 @@ def planned(steps, adjoint, worlds=300):
 
 
 def test_memory_does_not_grow_with_the_steps():
-    """Only the step numbers grow, in each pass once for all worlds; the estimate is XLA's plan."""
+    """Only the step numbers of both passes grow, once for all worlds; the estimate has them."""
     short, long = planned(100, jc.adjoints.Reversible()), planned(10_000, jc.adjoints.Reversible())
     assert long - short < 2 * 8 * 9_900
     memory = jc.analysis.gradient_memory(SYSTEM, METHOD, STATE)
-    told = memory.of(300, 10_000, jc.adjoints.Reversible())
-    assert abs(told - long) < 0.1 * long + 8 * 10_000  # the step numbers of one pass
+    assert abs(memory.of(300, 10_000, jc.adjoints.Reversible()) / long - 1) < 0.1
     assert long < memory.of(300, 100)
 
 

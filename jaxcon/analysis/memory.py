@@ -195,8 +195,8 @@ def nothing(state: State, info: StepInfo) -> None:
 
 
 def _numbers(steps: int) -> int:
-    """Returns the size of a rollout's array of step indices [B]. All worlds share this array."""
-    return steps * np.dtype(jnp.result_type(int)).itemsize
+    """Returns the size of the step indices of both passes [B]. All worlds share these arrays."""
+    return 2 * steps * np.dtype(jnp.result_type(int)).itemsize
 
 
 def _planned(f: Callable[..., Any], args: PyTree, worlds: int) -> int:
