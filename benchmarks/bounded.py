@@ -32,6 +32,7 @@ from benchmarks import timing
 
 STEP = 2e-3  # [s]
 SOLVERS = {
+    "Newton": jc.solvers.Newton(),
     **{f"GaussSeidel({n})": jc.solvers.GaussSeidel(sweeps=n) for n in (5, 15, 50, 150)},
     **{f"InteriorPoint({n})": jc.solvers.InteriorPoint(iterations=n) for n in (5, 10, 15, 30)},
 }

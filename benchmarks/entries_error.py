@@ -202,17 +202,16 @@ def bounded(quick: bool) -> list[Metric]:
 
 @entry("falls", MUJOCO, GYMNASIUM)
 def falls(quick: bool) -> list[Metric]:
-    """Checks that fallen walkers come to rest and that a heavy column stays up."""
+    """Checks that fallen robots come to rest and that a heavy column stays up."""
     from benchmarks import falls as study
 
-    stood = study.stand(
-        "GaussSeidel" if quick else "InteriorPoint", "float32", 0.05 if quick else 60
-    )
+    stood = study.stand("default", "float32", 0.05 if quick else 60)
     metrics = [error("column, moved", stood.moved, "m", 1e-6)]
-    if not quick:
-        fallen = study.drop("GaussSeidel", "float32", 1000, 4.0)
-        metrics.append(count("walkers, failed", fallen.failed))
-        metrics.append(error("walkers, speed of nine of ten", fallen.speeds[1], "rad/s", 1e-4))
+    for name in ("walker2d",) if quick else ("walker2d", "ant"):
+        fallen = study.drop(name, "default", "float32", *((32, 0.2) if quick else (4096, 4.0)))
+        metrics.append(count(f"{name}, failed", fallen.failed))
+        if name == "walker2d" and not quick:
+            metrics.append(error(f"{name}, speed of nine of ten", fallen.speeds[1], "rad/s", 1e-3))
     return metrics
 
 

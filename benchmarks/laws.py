@@ -30,7 +30,7 @@ class Laws(NamedTuple):
     """The largest relative violation of each contact law by one step.
 
     The target velocities u* of contacts that land during the step are those of `impacts.landing`.
-    Both solvers are thus compared on steps that solve one problem, not on impacts.
+    The solvers are thus compared on steps that solve one problem, not on impacts.
 
     Velocities are divided by V, the largest initial velocity. Multipliers are expressed by the
     velocity that they cause in their own row: λ̂ = h g λ/V, with g from `moved`. Let û = (J v⁺ −
@@ -68,8 +68,12 @@ class OneProblem(jc.solvers.InteriorPoint):
     exact = False
 
 
-JUDGED = {"GaussSeidel(30)": jc.solvers.GaussSeidel(), "InteriorPoint(30)": OneProblem()}
-"""Both solvers with default parameters. A landing is shared with the next step."""
+JUDGED = {
+    "Newton": jc.solvers.Newton(),
+    "GaussSeidel(30)": jc.solvers.GaussSeidel(),
+    "InteriorPoint(30)": OneProblem(),
+}
+"""The solvers with default parameters. A landing is shared with the next step."""
 BLOCK = 1000
 """Number of worlds in a batch."""
 

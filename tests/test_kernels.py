@@ -225,8 +225,8 @@ UNSUPPORTED = {
     "erf": lambda x: jax.lax.erf(x),
     "int8": lambda x: x.astype(jnp.int8),
     "product of nothing": lambda x: jnp.prod(x[:0]) + x[0],
-    "scatter": lambda x: x.at[x[0, 0].astype(int)].set(0.0),
-    "beyond": lambda x: x.at[jnp.array([0, 7])].get(mode="fill"),
+    "scatter": lambda x: x.at[x[0, 0].astype(int), x[0, 1].astype(int)].set(0.0),
+    "many places": lambda x: jnp.arange(5000.0)[x[0, 0].astype(int)] + x,
     "remainder": lambda x: x % 3,
     "unsigned": lambda x: -x.astype(jnp.uint32),
     "sort": jnp.sort,
@@ -460,6 +460,40 @@ def at_place(x: Any, k: Any) -> Any:
     )
 
 
+def at_index(x: Any, k: Any) -> Any:
+    """Reads and replaces rows at a traced index, which may lie beyond the array."""
+    some, others = jnp.array([0, 2], jnp.int32), jnp.array([1, 0])
+    return (
+        x.at[k].get(mode="clip"),
+        x.at[k].get(mode="fill"),
+        x.at[k].get(mode="fill", fill_value=4),
+        x.astype(jnp.int32).at[k].get(mode="fill"),
+        (x > 0).at[k].get(mode="fill"),
+        x.at[:, k].get(mode="fill"),
+        x.at[:, others].get(),
+        x.at[some, others].get(),
+        x.at[some + k].get(mode="fill"),
+        x.at[jnp.array([0, 9])].get(mode="fill"),
+        x.at[k].set(x[0]),
+        x.at[k].add(x[0], mode="clip"),
+        x.at[k, 1].set(5.0),
+        x[:1].at[k].set(5.0),
+        x.at[some + k].add(x[:2]),
+        x.at[jnp.array([0, 9])].set(5.0),
+    )
+
+
+def by_table(x: Any) -> Any:
+    """Loops over the rows of known numbers, and of numbers that are not in memory."""
+    table = np.array([[0.5, 1.0], [2.0, -1.0], [0.25, 3.0]], np.float32)
+    known = jax.lax.scan(lambda c, row: (row[0] * c + row[1], None), x, jnp.asarray(table))[0]
+    return jax.lax.scan(lambda c, row: (c * row[None], None), known, 2 * x)[0]
+
+
+def iterated(x: Any) -> Any:
+    return jax.lax.scan(lambda c, _: (c * 0.5 + 1, None), x, None, length=7)[0]
+
+
 def whole(x: Any) -> Any:
     k = x.astype(jnp.int32)
     return (
@@ -504,6 +538,9 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     (replaced, (ARRAY,)),
     (reduced, (ARRAY,)),
     *[(at_place, (ARRAY, np.int32(k))) for k in PLACES],
+    *[(at_index, (ARRAY, np.int32(k))) for k in PLACES],
+    (by_table, (ARRAY,)),
+    (iterated, (ARRAY,)),
     (whole, (4 * ARRAY,)),
     (logical, (ARRAY,)),
 ]
@@ -514,9 +551,10 @@ def test_operations(platform, function, args):
     check_operations(platform, function, args)
 
 
-@pytest.mark.parametrize("function", [scanned, repeated, reduced, at_each])
+@pytest.mark.parametrize("function", [scanned, repeated, reduced, at_each, by_table, iterated])
 def test_loops_that_are_not_written_round_by_round(platform, function, monkeypatch):
-    monkeypatch.setattr(entries, "MAX_UNROLLED", 0)
+    for limit in ("MAX_UNROLLED", "MAX_ITERATED"):
+        monkeypatch.setattr(entries, limit, 0)
     check_operations(platform, function, (ARRAY,))
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import jaxcon as jc
+from benchmarks import laws as study
 from jaxcon.constraints.joint_trees import tree_equations
 from jaxcon.constraints.rows import linearize, saddle
 from jaxcon.contact import newton
@@ -523,3 +524,21 @@ def test_a_derivative_of_newton_starts_from_its_solution_and_one_of_sweeps_does_
         closed = jax.make_jaxpr(lambda s, m=method: jc.step(system, m, s, None, H)[0])(start)
         (native,) = natives(closed.jaxpr)
         assert (native.guess is not None) == expected
+
+
+@pytest.mark.parametrize(
+    ("name", "dtype", "most"),
+    [
+        ("column", "float64", 0),  # the topmost block is a thousand times heavier
+        ("chain", "float64", 0.01),
+        ("box", "float64", 0.02),
+        ("chain", "float32", 0.02),
+        ("box", "float32", 0.03),
+    ],
+)
+def test_random_states_meet_the_laws_to_rounding(name, dtype, most):
+    """All but a few of the worlds; those take more iterations than a step has."""
+    solver = jc.solvers.Newton(tolerance=1e-6 if dtype == "float32" else 1e-10)
+    beyond = study.beyond(study.measure(name, jnp.dtype(dtype), solver, 400), dtype)
+    assert max(beyond.complementarity, beyond.cone, beyond.separation) <= most * 400
+    assert beyond.energy == 0

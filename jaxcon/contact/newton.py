@@ -13,7 +13,8 @@ laws and the equations of motion Nᵀ M N z = Nᵀ Jᵀ Λ are then the conditio
 
 Newton's method with a line search solves it. Its matrix is Nᵀ (M + Jᵀ D J) N, with D = −∂Λ/∂(J v).
 After each full step the new Λ becomes the estimate Λ̂. A fixed point Λ = Λ̂ satisfies the laws of
-`contact.bounded` for every R.
+`contact.bounded` for every R. A large R decides soon which rows act; once they no longer change, a
+smaller R lets Λ̂ converge in fewer steps, also with extreme ratios of masses.
 
 References:
     Castro, Permenter, Han, An Unconstrained Convex Formulation of Compliant Contact, IEEE Trans.
@@ -54,14 +55,26 @@ EASE = 0.5
 needs fewer iterations."""
 
 LEAST = 0.1
-"""The least product of these factors."""
+"""The least product of these factors in the first iterations."""
+
+PATIENCE = 6
+"""The number of iterations after which R is chosen by how they converge."""
+
+SLOW = 0.5
+"""The change of Λ̂ in a full step, relative to that of the step before, above which R shrinks."""
+
+SHRINK = 0.2
+"""The factor of R then. If other rows act after a step, R returns to `LEAST`."""
+
+LEAST_IN_SINGLE, LEAST_IN_DOUBLE = 1e-3, 1e-6
+"""The least product of all factors, by precision. A smaller R would be lost in rounding of Λ̂."""
 
 TERMS = 24
 """The largest number of rows between two bodies in Newton's matrix. Its steps are too long for
 further rows that act, which converge slowly or not at all; `info.reactions.residual` tells."""
 
 
-ITERATIONS, ITERATIONS_IN_DOUBLE = 12, 30
+ITERATIONS, ITERATIONS_IN_DOUBLE = 25, 60
 """The default largest numbers of iterations in single and in double precision."""
 
 
@@ -86,8 +99,8 @@ class Newton(checks.Checked, ContactSolver):
     `GaussSeidel()` instead. So is what an `ActiveSet` around this solver leaves.
 
     Attributes:
-        iterations: the largest number of iterations in a step; None for 12 in single precision and
-            30 in double precision.
+        iterations: the largest number of iterations in a step; None for 25 in single precision and
+            60 in double precision.
         tolerance: the violation of the laws at which a world is done [m/s, rad/s]; None for 5e-5 in
             single precision and 1e-8 in double precision. Rounding adds 64 ε |u|, where u is the
             fastest row.
@@ -187,6 +200,16 @@ class Laws(NamedTuple):
         )
         return jnp.where(self.acts, λ, 0)
 
+    def regimes(self, center: Array, velocity: Array) -> Array:
+        """Returns masks of the rows inside of their bounds, and of the discs that slide."""
+        x, here = self.kinds.split(self.ahead(center, velocity)), self.kinds.split(center)
+        pressed = jnp.maximum(here.normal, 0)
+        flags = [x.single > 0, (x.box > self.lower) & (x.box < self.upper), x.normal > 0]
+        for disc, μ, y in zip(self.kinds.discs, self.coefficients, x.discs, strict=True):
+            if len(y):
+                flags.append(numerics.norm(y) > μ * disc.of(pressed))
+        return jnp.concatenate(flags)
+
     def slope(self, center: Array, velocity: Array) -> tuple[Array, list[tuple[Array, Vector]]]:
         """Returns −∂λ/∂u: its diagonal part a, (n,), and for each disc b and t of −b t tᵀ."""
         stiff = jnp.where(self.acts, 1 / (self.regularization + self.compliance), 0)
@@ -236,6 +259,8 @@ class State(NamedTuple):
         forces: Jᵀ Λ − M N z, minus the derivative of the objective, on bodies and on joints.
         going: True in worlds that are not done, ().
         ease: the factor of R, (1,).
+        moved: the change of Λ̂ in the last full step, as the largest velocity SHARE g |ΔΛ̂|, () [m/s,
+            rad/s].
     """
 
     iteration: Array
@@ -246,6 +271,7 @@ class State(NamedTuple):
     forces: tuple[ByBranch, ByBranch]
     going: Array
     ease: Array
+    moved: Array
 
 
 class Problem(NamedTuple):
@@ -264,7 +290,13 @@ class Problem(NamedTuple):
     tolerance: Array
 
     def judged(
-        self, iteration: Array, velocity: Array, center: Array, momentum: Momentum, ease: Array
+        self,
+        iteration: Array,
+        velocity: Array,
+        center: Array,
+        momentum: Momentum,
+        ease: Array,
+        moved: Array,
     ) -> State:
         """Returns the state with its impulses; a world goes on while it violates the laws.
 
@@ -282,7 +314,7 @@ class Problem(NamedTuple):
                 left = jnp.maximum(left, jnp.max(jnp.abs(g * x), axis=0))
         going = left > self.tolerance  # False for NaN: `ContactProblem.judge` stops such a world
         forces = self.wide(forces[0]), self.wide(forces[1])
-        return State(iteration, velocity, center, impulses, momentum, forces, going, ease)
+        return State(iteration, velocity, center, impulses, momentum, forces, going, ease, moved)
 
     def iterate(self, state: State) -> State:
         """Returns the state after a step of Newton's method."""
@@ -313,9 +345,26 @@ class Problem(NamedTuple):
             lambda p, d: p + α * d, state.momentum, tuple(map(self.wide, momentum))
         )
         new = laws.project(state.center, velocity)
-        center = jnp.where((going & is_whole)[None], new, state.center)
-        ease = jnp.where(is_whole, jnp.maximum(EASE * state.ease, LEAST), state.ease)
-        after = self.judged(state.iteration + 1, velocity, center, momentum, ease)
+
+        def early() -> tuple[Array, Array, Array]:
+            shrunk = jnp.maximum(EASE * state.ease, LEAST)
+            return is_whole, jnp.where(is_whole, shrunk, state.ease), state.moved
+
+        def late() -> tuple[Array, Array, Array]:
+            before, after = (laws.regimes(state.center, x) for x in (state.velocity, velocity))
+            settled = is_whole & jnp.all(before == after, axis=0)
+            moved = jnp.max(self.laws.regularization * jnp.abs(new - state.center), axis=0)
+            # where the same rows act as before, only Λ̂ is left to converge, faster with small R
+            slow = settled & (moved > SLOW * state.moved)
+            least = LEAST_IN_DOUBLE if velocity.dtype == jnp.float64 else LEAST_IN_SINGLE
+            shrunk = jnp.maximum(SHRINK * state.ease, least)
+            kept = jnp.where(settled, state.ease, jnp.maximum(state.ease, LEAST))
+            accepted = settled | (is_whole & (state.ease[0] >= LEAST))
+            return accepted, jnp.where(slow, shrunk, kept), jnp.where(is_whole, moved, state.moved)
+
+        accepted, ease, moved = jax.lax.cond(state.iteration >= PATIENCE, late, early)
+        center = jnp.where((going & accepted)[None], new, state.center)
+        after = self.judged(state.iteration + 1, velocity, center, momentum, ease, moved)
         # a world that is done keeps its impulses
         return after._replace(
             impulses=jnp.where(going[None], after.impulses, state.impulses),
@@ -423,9 +472,12 @@ def multipliers(
     def goes(state: State) -> Array:
         return (state.iteration < most) & somewhere(state.going)
 
-    first = problem.judged(iteration, velocity, center, momentum, ones)
+    first = problem.judged(iteration, velocity, center, momentum, ones, jnp.inf * ones[0])
     last = jax.lax.while_loop(goes, problem.iterate, first)
-    found = Found(numerics.safe_divide(last.impulses, h), mass, movable)
+    # with a small R, impulses are large until the step is whole
+    unsettled = last.going & (last.ease[0] < LEAST)
+    impulses = jnp.where(unsettled[None], last.center, last.impulses)
+    found = Found(numerics.safe_divide(impulses, h), mass, movable)
     if sorts:
         back = np.argsort(order)
         found = Found(found.multipliers[back], found.mass[back], found.movable[back])

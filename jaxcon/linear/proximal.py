@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -126,12 +127,13 @@ class RankSafe(checks.Checked, Solver):
         length = jnp.sqrt(weight)
 
         def solve(force: Array, target: Array) -> Solution:
-            def iterate_once(right: Array, _: None) -> tuple[Array, Solution]:
+            def iterate_once(before: tuple[Array, Solution], _: None) -> Any:
+                right = before[0]
                 solution = iterate(force, right, jnp.zeros_like(right))
-                return right - remainder(system, right, solution), solution
+                return (right - remainder(system, right, solution), solution), None
 
-            met, solutions = jax.lax.scan(iterate_once, target, None, length=2)
-            solution = jax.tree.map(lambda x: x[1], solutions)
+            start = target, unsolved(force, target, weight.shape[1:])
+            (met, solution), _ = jax.lax.scan(iterate_once, start, None, length=2)
             limit = 1e-2 if self.conflict is None else jnp.asarray(self.conflict, dtype)
             code = conflicts(system, force, target, target - met, length, limit)
             return solution._replace(status=first(solution.status, code))
@@ -158,12 +160,11 @@ def proximal(
     solve = solver.factor(dataclasses.replace(system, compliance=compliance))
 
     def iterate(force: Array, target: Array, multipliers: Array) -> Solution:
-        batch = jnp.broadcast_shapes(force.shape[1:], target.shape[1:], weight.shape[1:])
-        start = jnp.broadcast_to(multipliers, (len(target), *batch))
+        unknown = unsolved(force, target, weight.shape[1:])
+        start = jnp.broadcast_to(multipliers, unknown.multipliers.shape)
         if rounds == 1:
             return solve(force, target + weight * start)
-        code = jnp.zeros(batch, jnp.int32)
-        unknown = Solution(jnp.zeros((len(force), *batch), force.dtype), start, code)
+        unknown = unknown._replace(multipliers=start)
         return jax.lax.scan(
             lambda known, _: (solve(force, target + weight * known.multipliers), None),
             unknown,
@@ -172,6 +173,20 @@ def proximal(
         )[0]
 
     return iterate
+
+
+def unsolved(force: Array, target: Array, batch: tuple[int, ...]) -> Solution:
+    """Returns a solution of zeros, from which an iteration starts.
+
+    Args:
+        force: f, (n_v,).
+        target: b, (n_c,).
+        batch: the trailing batch axes of other numbers of the system.
+    """
+    batch = jnp.broadcast_shapes(force.shape[1:], target.shape[1:], batch)
+    code = jnp.zeros(batch, jnp.int32)
+    acceleration, multipliers = (jnp.zeros((len(x), *batch), x.dtype) for x in (force, target))
+    return Solution(acceleration, multipliers, code)
 
 
 def scaled(system: Saddle, floor: Scalar) -> Array:

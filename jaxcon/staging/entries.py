@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jax.extend.core import ClosedJaxpr
+from jax.extend.core import ClosedJaxpr, Var
 
 from jaxcon.core.host import ELEMENTWISE, STRUCTURAL
 from jaxcon.core.jaxprs import read_arguments
@@ -51,6 +52,18 @@ MAX_ROUNDS = 64
 
 MAX_UNROLLED = 50_000
 """The largest number of instructions of such a loop, if it can be written as a loop."""
+
+MAX_ITERATED = 1000
+"""The largest number of instructions of such a loop whose rounds are all the same.
+
+Nothing in them is known better round by round.
+"""
+
+MAX_CHOSEN = 64
+"""The largest number of known entries of which each round of a loop reads a row.
+
+The row is chosen by its index among all rows.
+"""
 
 MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
@@ -207,8 +220,10 @@ class Evaluation:
         if id(body) not in self._programs:
             self._programs[id(body)] = body, Program(body.closed, _body, body.constants)
         sinks, self._sinks = self._sinks, {}
-        results = self._run(self._programs[id(body)][1], args)
-        self._sinks = sinks
+        try:
+            results = self._run(self._programs[id(body)][1], args)
+        finally:
+            self._sinks = sinks
         return list(map(_read, results))
 
     def _run(self, program: Program, args: Sequence[Any]) -> list[Any]:
@@ -375,7 +390,7 @@ class Evaluation:
             operands: its operands.
             sinks: where each of its results goes, if it is a result of the whole program.
         """
-        constants, carries = _counts(params)
+        constants, carries = _sizes(params)
         length, body = params["length"], self._once(params, "jaxpr")
         used = read_arguments(body.closed.jaxpr)
         fixed, rows = operands[:constants], operands[constants + carries :]
@@ -385,12 +400,13 @@ class Evaluation:
             x if flag else None for x, flag in zip(rows, used[constants + carries :], strict=True)
         ]
         places = sinks[carries:]
-        inputs_fit = all(isinstance(x, Stored | None) for x in rows)
-        repeats = length > 1 and inputs_fit and all(places) and not params["reverse"]
+        repeats = length > 1 and all(places) and not params["reverse"] and self._fit(rows)
         if length > MAX_ROUNDS and repeats:
             return self._repeat(body, fixed, carried, rows, places, length)
         if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
+        same = not any(x is not None for x in rows) and not places and not _counts(body, constants)
+        limit = MAX_ITERATED if same else MAX_UNROLLED
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
 
@@ -401,7 +417,7 @@ class Evaluation:
         order = range(length)
         for k in reversed(order) if params["reverse"] else order:
             # indices that count rounds are known numbers if the loop is written round by round
-            most = MAX_UNROLLED // length if repeats and k == 0 else None
+            most = limit // length if repeats and k == 0 else None
             extra = self._extra
             both = self.thread.tried(lambda k=k: one(k), most)
             if both is None:
@@ -418,7 +434,7 @@ class Evaluation:
         body: Body,
         fixed: list[Entries],
         start: list[Entries],
-        rows: Sequence[Stored | None],
+        rows: Sequence[Stored | Entries | None],
         places: Sequence[Any],
         length: int,
     ) -> list[Any]:
@@ -435,102 +451,174 @@ class Evaluation:
         shapes = [x.shape for x in start]
         kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
         before = self.thread.length + self._extra
+        # a register that counts the rounds, if one of them reads a row of known or computed numbers
+        count = [np.int32(0)] if any(isinstance(x, np.ndarray) for x in rows) else []
 
         def run(counter: Counter, carried: Sequence[Scalar]) -> list[Scalar]:
-            given = [_row(x, counter, aval) for x, aval in zip(rows, kinds, strict=True)]
-            results = self(body, [*fixed, *_unflattened(carried, shapes), *given])
+            index, numbers = carried[: len(count)], carried[len(count) :]
+            given = [
+                self._chosen(x, index[0]) if isinstance(x, np.ndarray) else _row(x, counter, aval)
+                for x, aval in zip(rows, kinds, strict=True)
+            ]
+            results = self(body, [*fixed, *_unflattened(numbers, shapes), *given])
             for x, place in zip(results[len(start) :], places, strict=True):
                 place.row(counter).write(x)
-            return _flat(results[: len(start)])
+            following = [self.thread.apply("add", x, np.int32(1)) for x in index]
+            return [*following, *_flat(results[: len(start)])]
 
         outside, self._repeating = self._repeating, True
-        final = self.thread.repeat(length, run, _flat(start))
-        self._repeating = outside
+        try:
+            final = self.thread.repeat(length, run, [*count, *_flat(start)])[len(count) :]
+        finally:
+            self._repeating = outside
         self._extra += (self.thread.length + self._extra - before) * (length - 1)
         if self._extra > MAX_WORK:
             raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
         return [*_unflattened(final, shapes), *places]
 
-    def _index(self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...]) -> Any:
-        """Returns, for a slice that starts at traced indices, each possible start and its flag.
+    def _fit(self, rows: Sequence[Any]) -> bool:
+        """Returns whether each round of a loop can read its rows of these arrays."""
+        chosen = [x for x in rows if isinstance(x, np.ndarray)]
+        few = sum(x.size for x in chosen) <= MAX_CHOSEN
+        return few and all(len(x) <= self._max_places for x in chosen)
+
+    def _chosen(self, x: Entries, index: Any) -> Entries:
+        """Writes the choice of a row of an array at an index."""
+        starts = [index, *[np.int32(0)] * (x.ndim - 1)]
+        return self._slice(x, starts, (1, *x.shape[1:]), None).squeeze(0)
+
+    def _index(
+        self, starts: Sequence[Any], sizes: Sequence[int], shape: tuple[int, ...], clamps: bool
+    ) -> Any:
+        """Returns, for a slice that starts at given indices, each possible start and its flag.
+
+        Args:
+            starts: the indices of the first entry.
+            sizes: the shape of the slice.
+            shape: the shape of the array.
+            clamps: True to move a slice beyond the array to the nearest place within. Otherwise it
+                has no place.
 
         Raises:
-            UnsupportedError: two of the indices are traced.
+            UnsupportedError: two of the indices are traced, or there are too many places.
         """
         limits = [n - size for n, size in zip(shape, sizes, strict=True)]
         traced = [
             a
             for a, (x, most) in enumerate(zip(starts, limits, strict=True))
-            if most and not isinstance(x, np.generic)
+            if (most or not clamps) and not isinstance(x, np.generic)
         ]
         if len(traced) > 1:
             raise UnsupportedError("a slice from several traced indices")
-        known = [
-            min(max(int(x), 0), most) if isinstance(x, np.generic) else 0
-            for x, most in zip(starts, limits, strict=True)
-        ]
+        known = [int(x) if isinstance(x, np.generic) else 0 for x in starts]
+        within = [min(max(x, 0), most) for x, most in zip(known, limits, strict=True)]
+        if within != known and not clamps:
+            return []
         if not traced:
-            return [(tuple(known), np.True_)]
+            return [(tuple(within), np.True_)]
         (axis,) = traced
-        if self._repeating and limits[axis] >= self._max_places:
-            raise UnsupportedError(f"a slice at one of {limits[axis] + 1} places")
+        count = limits[axis] + 1
+        if count > self._max_places if self._repeating else count * math.prod(sizes) > MAX_LOADS:
+            raise UnsupportedError(f"a slice at one of {count} places")
         index, places = starts[axis], []
-        for k in range(limits[axis] + 1):
+        for k in range(count):
             # a start beyond the array moves to the nearest one within
-            name = "le" if k == 0 else "ge" if k == limits[axis] else "eq"
+            name = "eq" if not clamps else "le" if k == 0 else "ge" if k == count - 1 else "eq"
             flag = self.thread.apply(name, index, index.dtype.type(k))
-            places.append(((*known[:axis], k, *known[axis + 1 :]), flag))
+            places.append(((*within[:axis], k, *within[axis + 1 :]), flag))
         return places
 
-    def _dynamic_slice(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
-        """Writes a slice from a traced index, as selections among all possible slices."""
-        x, starts = operands[0], [y[()] for y in operands[1:]]
-        sizes = params["slice_sizes"]
-        result: Any = None
-        for start, flag in self._index(starts, sizes, x.shape):
-            part = x[tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))]
+    def _slice(
+        self, x: Entries, starts: Sequence[Any], sizes: Sequence[int], other: np.generic | None
+    ) -> Entries:
+        """Writes a slice, as selections among all possible ones if an index is traced.
+
+        Args:
+            x: the array.
+            starts: the indices of the first entry of the slice.
+            sizes: the shape of the slice.
+            other: the number that a slice beyond the array has instead. With None it is moved to
+                the nearest place within.
+        """
+        result: Any = None if other is None else entries(np.full(sizes, other))
+        for start, flag in self._index(starts, sizes, x.shape, clamps=other is None):
+            part = x[_window(start, sizes)]
             result = (
                 part
                 if result is None
                 else self._each("select_n", {}, [_scalar(flag), result, part])
             )
-        return [result]
+        return result
+
+    def _update(
+        self, x: Entries, starts: Sequence[Any], sizes: Sequence[int], clamps: bool, new: Any
+    ) -> None:
+        """Writes a change of a slice in place.
+
+        Args:
+            x: the array.
+            starts: the indices of the first entry of the slice.
+            sizes: the shape of the slice.
+            clamps: see `_index`.
+            new: function of the slice → the new slice.
+        """
+        changed = x.copy()
+        for start, flag in self._index(starts, sizes, x.shape, clamps):
+            place = _window(start, sizes)
+            pair = [changed[place], new(x[place])]
+            changed[place] = self._each("select_n", {}, [_scalar(flag), *pair])
+        x[...] = changed
+
+    def _dynamic_slice(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes a slice from a traced index, as selections among all possible slices."""
+        x, starts = operands[0], [y[()] for y in operands[1:]]
+        return [self._slice(x, starts, params["slice_sizes"], None)]
 
     def _dynamic_update_slice(
         self, params: Mapping[str, Any], operands: list[Entries]
     ) -> list[Entries]:
         """Writes the replacement of a slice from a traced index."""
-        x, new, starts = operands[0], operands[1], [y[()] for y in operands[2:]]
-        result = x.copy()
-        for start, flag in self._index(starts, new.shape, x.shape):
-            place = tuple(slice(a, a + n) for a, n in zip(start, new.shape, strict=True))
-            result[place] = self._each("select_n", {}, [_scalar(flag), result[place], new])
-        return [result]
+        x, new, starts = operands[0].copy(), operands[1], [y[()] for y in operands[2:]]
+        self._update(x, starts, new.shape, True, lambda _: new)
+        return [x]
+
+    def _gather(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes `lax.gather`: one slice for each row of indices."""
+        x, indices = operands
+        numbers, sizes = params["dimension_numbers"], params["slice_sizes"]
+        if numbers.operand_batching_dims:
+            raise UnsupportedError("a gather with batch axes")
+        other = _filling(params, x.flat[0].dtype) if x.size else None
+        outer, dropped = indices.shape[:-1], tuple(numbers.collapsed_slice_dims)
+        inner = [n for a, n in enumerate(sizes) if a not in dropped]
+        slices = np.empty((*outer, *inner), object)
+        for place in np.ndindex(outer):
+            starts = _starts(numbers.start_index_map, indices[place], x.ndim)
+            slices[(*place, ...)] = self._slice(x, starts, sizes, other).squeeze(dropped)
+        rank, offsets = slices.ndim, list(numbers.offset_dims)
+        order = [*(a for a in range(rank) if a not in offsets), *offsets]
+        return [np.transpose(slices, np.argsort(order))]
 
     def _scatter(self, params: Mapping[str, Any], operands: list[Entries], adds: bool) -> Entries:
-        """Writes the replacement of entries at known indices, or additions to them.
-
-        Raises:
-            UnsupportedError: the indices are traced, or beyond the array.
-        """
-        x, indices, updates = operands
+        """Writes `lax.scatter` or `lax.scatter_add`: changes one slice for each row of indices."""
+        x, indices, updates = operands[0].copy(), *operands[1:]
         numbers = params["dimension_numbers"]
-        known = all(isinstance(i, np.generic) for i in indices.ravel())
-        if not known or numbers.operand_batching_dims:
-            raise UnsupportedError("a scatter at traced indices")
-        result, window = x.copy(), numbers.update_window_dims
-        outer = [a for a in range(updates.ndim) if a not in window]
-        inner = [a for a in range(x.ndim) if a not in numbers.inserted_window_dims]
-        for entry in np.ndindex(updates.shape):
-            place = np.zeros(x.ndim, int)
-            place[inner] = [entry[a] for a in window]
-            index = indices[tuple(entry[a] for a in outer)]
-            place[list(numbers.scatter_dims_to_operand_dims)] += index.astype(int)
-            if (place < 0).any() or (place >= x.shape).any():
-                raise UnsupportedError("a scatter beyond the array")
-            at, new = tuple(place), updates[entry]
-            result[at] = self._one("add", {}, result[at], new) if adds else new
-        return result
+        if numbers.operand_batching_dims:
+            raise UnsupportedError("a scatter with batch axes")
+        inner = list(numbers.update_window_dims)
+        outer = [a for a in range(updates.ndim) if a not in inner]
+        moved = np.transpose(updates, [*outer, *inner])
+        clamps = params["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP
+        for place in np.ndindex(moved.shape[: len(outer)]):
+            new = np.expand_dims(moved[(*place, ...)], tuple(numbers.inserted_window_dims))
+            starts = _starts(numbers.scatter_dims_to_operand_dims, indices[place], x.ndim)
+            change = (
+                (lambda old, new=new: self._each("add", {}, [old, new]))
+                if adds
+                else (lambda _, new=new: new)
+            )
+            self._update(x, starts, new.shape, clamps, change)
+        return x
 
     def _extreme_index(self, name: str, params: Mapping[str, Any], x: Entries) -> Entries:
         """Writes argmax or argmin: the first index of the extreme; of NaN, if there is one."""
@@ -631,7 +719,24 @@ def _contracted(x: Entries, summed: Sequence[int], batch: Sequence[int]) -> Entr
     return moved.reshape(*moved.shape[: len(batch) + len(free)], -1)
 
 
-def _counts(params: Mapping[str, Any]) -> tuple[int, int]:
+def _counts(body: Body, constants: int) -> bool:
+    """Returns whether a loop carries a number to which each round adds a known one.
+
+    Args:
+        body: the body of the loop.
+        constants: the number of its arguments before the carried values.
+    """
+    jaxpr = body.closed.jaxpr
+    sums = {eqn.outvars[0]: eqn.invars for eqn in jaxpr.eqns if eqn.primitive.name == "add"}
+    carried = zip(jaxpr.invars[constants:], jaxpr.outvars, strict=False)
+    return any(
+        isinstance(after, Var) and after in sums and before in sums[after]
+        for before, after in carried
+        if not before.aval.shape and jnp.issubdtype(before.aval.dtype, jnp.integer)
+    )
+
+
+def _sizes(params: Mapping[str, Any]) -> tuple[int, int]:
     """Returns the numbers of constants and of carried values of a scan.
 
     From JAX 0.11 on, a tree of the arguments takes the place of these numbers.
@@ -676,25 +781,30 @@ def _pad(params: Mapping[str, Any], x: Entries, value: Entries) -> Entries:
     return padded[tuple(cut)]
 
 
-def _gather(params: Mapping[str, Any], x: Entries, indices: Entries) -> Entries:
-    """Takes rows at known indices, as in x[indices].
+def _window(start: Sequence[int], sizes: Sequence[int]) -> tuple[slice, ...]:
+    """Returns the slices of each axis that begin at `start`."""
+    return tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))
 
-    Raises:
-        UnsupportedError: the indices are traced, or the gather takes anything but whole rows.
-    """
-    numbers = params["dimension_numbers"]
-    rank = x.ndim
-    whole = tuple(params["slice_sizes"]) == (1, *x.shape[1:])
-    plain = tuple(numbers.start_index_map) == (0,) and tuple(numbers.collapsed_slice_dims) == (0,)
-    last = tuple(numbers.offset_dims) == tuple(range(indices.ndim - 1, indices.ndim + rank - 2))
-    known = all(isinstance(i, np.generic) for i in indices.ravel())
-    if not (whole and plain and last and known) or indices.shape[-1] != 1:
-        raise UnsupportedError("a gather at traced indices")
-    places = indices[..., 0].astype(int)
-    inside = np.clip(places, 0, len(x) - 1)
-    if params["mode"] == jax.lax.GatherScatterMode.FILL_OR_DROP and (places != inside).any():
-        raise UnsupportedError("a gather beyond the array")
-    return x[inside]
+
+def _starts(axes: Sequence[int], indices: Entries, rank: int) -> list[Any]:
+    """Returns the indices of the first entry of a slice, of which those of some axes are given."""
+    starts: list[Any] = [np.int32(0)] * rank
+    for axis, index in zip(axes, indices, strict=True):
+        starts[axis] = index
+    return starts
+
+
+def _filling(params: Mapping[str, Any], dtype: np.dtype) -> np.generic | None:
+    """Returns the number that a gather has in place of slices beyond the array; None if none."""
+    if params["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP:
+        return None
+    value = params.get("fill_value")
+    if value is None and dtype.kind == "b":
+        value = True
+    elif value is None and np.issubdtype(dtype, np.integer):
+        limits = np.iinfo(dtype)
+        value = limits.min if np.issubdtype(dtype, np.signedinteger) else limits.max
+    return dtype.type(np.nan if value is None else value)
 
 
 def _rows(x: Entries, axis: int) -> list[Entries]:
@@ -715,7 +825,7 @@ OTHERS: dict[str, Other] = {
     "empty": lambda run, params, x: [_zeros(params)],
     "empty2": lambda run, params, x: [_zeros(params)],
     "expand_dims": lambda run, params, x: [np.expand_dims(x[0], params["dimensions"])],
-    "gather": lambda run, params, x: [_gather(params, *x)],
+    "gather": Evaluation._gather,
     "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
     "pad": lambda run, params, x: [_pad(params, *x)],
     "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -38,6 +39,10 @@ LOGICAL = ("and", "or", "xor")
 
 class UnsupportedError(Exception):
     """A program contains an operation that has no instructions here."""
+
+
+class _TooLongError(Exception):
+    """What a thread writes on trial is too long."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +186,7 @@ class Thread:
     def __init__(self) -> None:
         self.statements: list[Statement] = []
         self.length = 0
+        self._limit = math.inf  # the length at which a trial ends
         self._count = itertools.count()
         # results of instructions, by instruction and operands; an inner table for each loop or
         # branch, since its results do not exist outside of it
@@ -220,6 +226,8 @@ class Thread:
     def _append(self, instruction: Instruction) -> None:
         self.statements.append(instruction)
         self.length += 1
+        if self.length > self._limit:
+            raise _TooLongError
 
     def load(self, address: Address, dtype: Any) -> Register:
         """Reads a number from memory; a bool from a byte.
@@ -361,15 +369,22 @@ class Thread:
         """
         if max_length is None:
             return write()
-        before = self.length
-        self._known.append({})
+        before, limit, depth = self.length, self._limit, len(self._known)
         outside, self.statements = self.statements, []
-        results = write()
+        self._known.append({})
+        self._limit = min(limit, before + max_length)
+        try:
+            results = write()
+        except _TooLongError:
+            if limit <= before + max_length:  # an outer trial ends first
+                raise
+            del self._known[depth:]
+            self.length, self.statements = before, outside
+            return None
+        finally:
+            self._limit = limit
         written, self.statements = self.statements, outside
         known = self._known.pop()
-        if self.length - before > max_length:
-            self.length = before
-            return None
         self.statements += written
         self._known[-1] |= known
         return results
