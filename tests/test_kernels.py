@@ -224,8 +224,6 @@ def test_a_result_that_worlds_share_counts_once(platform):
 UNSUPPORTED = {
     "erf": lambda x: jax.lax.erf(x),
     "int8": lambda x: x.astype(jnp.int8),
-    "product of nothing": lambda x: jnp.prod(x[:0]) + x[0],
-    "scatter": lambda x: x.at[x[0, 0].astype(int), x[0, 1].astype(int)].set(0.0),
     "many places": lambda x: jnp.arange(5000.0)[x[0, 0].astype(int)] + x,
     "remainder": lambda x: x % 3,
     "unsigned": lambda x: -x.astype(jnp.uint32),
@@ -448,6 +446,7 @@ def reduced(x: Any) -> Any:
         jnp.min(x, 0),
         flags.any(),
         flags.all(0),
+        jnp.prod(x, 1),
         jnp.argmax(x, 1),
         jnp.argmin(x),
         jnp.einsum("ij,kj->ik", x, x),
@@ -477,6 +476,9 @@ def at_index(x: Any, k: Any) -> Any:
         x.at[k].set(x[0]),
         x.at[k].add(x[0], mode="clip"),
         x.at[k, 1].set(5.0),
+        x.at[k, k - 1].get(mode="fill"),
+        x.at[k, k - 1].get(mode="clip"),
+        x.at[k, k - 1].set(5.0),
         x[:1].at[k].set(5.0),
         x.at[some + k].add(x[:2]),
         x.at[jnp.array([0, 9])].set(5.0),
@@ -488,6 +490,19 @@ def by_table(x: Any) -> Any:
     table = np.array([[0.5, 1.0], [2.0, -1.0], [0.25, 3.0]], np.float32)
     known = jax.lax.scan(lambda c, row: (row[0] * c + row[1], None), x, jnp.asarray(table))[0]
     return jax.lax.scan(lambda c, row: (c * row[None], None), known, 2 * x)[0]
+
+
+def of_nothing(x: Any) -> Any:
+    none = x[:0]
+    return (
+        jnp.sum(none, 0)[None] + x,
+        jnp.prod(none) + x,
+        jnp.max(none, 0, initial=3)[None] + x,
+        jnp.min(none, 0, initial=3)[None] + x,
+        jnp.any(none > 0) | (x > 0),
+        jnp.all(none > 0, 0)[None] & (x > 0),
+        none.T @ none + x[:2],
+    )
 
 
 def iterated(x: Any) -> Any:
@@ -507,6 +522,8 @@ def whole(x: Any) -> Any:
         -k,
         jnp.sign(k),
         k.astype(jnp.float32),
+        jax.lax.bitcast_convert_type(x, jnp.int32) & -4096,
+        jax.lax.bitcast_convert_type(k, jnp.float32),
     )
 
 
@@ -541,6 +558,7 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     *[(at_index, (ARRAY, np.int32(k))) for k in PLACES],
     (by_table, (ARRAY,)),
     (iterated, (ARRAY,)),
+    (of_nothing, (ARRAY,)),
     (whole, (4 * ARRAY,)),
     (logical, (ARRAY,)),
 ]

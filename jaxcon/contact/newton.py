@@ -356,7 +356,8 @@ class Problem(NamedTuple):
             moved = jnp.max(self.laws.regularization * jnp.abs(new - state.center), axis=0)
             # where the same rows act as before, only Λ̂ is left to converge, faster with small R
             slow = settled & (moved > SLOW * state.moved)
-            least = LEAST_IN_DOUBLE if velocity.dtype == jnp.float64 else LEAST_IN_SINGLE
+            single = jnp.finfo(velocity.dtype).bits <= 32
+            least = LEAST_IN_SINGLE if single else LEAST_IN_DOUBLE
             shrunk = jnp.maximum(SHRINK * state.ease, least)
             kept = jnp.where(settled, state.ease, jnp.maximum(state.ease, LEAST))
             accepted = settled | (is_whole & (state.ease[0] >= LEAST))

@@ -37,7 +37,7 @@ class Cpu:
 
     max_length = 400_000
     max_arrays = 10_000
-    max_places = 16
+    max_places = 24
 
     def text(
         self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int

@@ -37,11 +37,11 @@ Entries = np.ndarray[Any, np.dtype[np.object_]]
 """An array of scalars."""
 
 PAIRS = {"reduce_sum": "add", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and"}
-PAIRS |= {"reduce_or": "or"}
+PAIRS |= {"reduce_or": "or", "reduce_prod": "mul"}
 """The operation on two entries by which each reduction combines them."""
 
 ELEMENTARY = {*INSTRUCTIONS, *FUNCTIONS, *ELEMENTWISE}
-ELEMENTARY |= {"convert_element_type", "integer_pow", "round", "select_n"}
+ELEMENTARY |= {"bitcast_convert_type", "convert_element_type", "integer_pow", "round", "select_n"}
 """Elementwise primitives. Some of them are only evaluated if all operands are known."""
 
 PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
@@ -258,6 +258,11 @@ class Evaluation:
 
     def _each(self, name: str, params: Mapping[str, Any], operands: Sequence[Entries]) -> Entries:
         """Writes an elementwise operation on all entries; returns its result."""
+        shape = operands[0].shape
+        if all(x.size == 1 and x.shape == shape for x in operands):  # most operations of a step
+            result = np.empty(shape, object)
+            result[...] = self._one(name, params, *(x.item() for x in operands))
+            return result
         shape = np.broadcast_shapes(*(x.shape for x in operands))
         given = [x if x.shape == shape else np.broadcast_to(x, shape) for x in operands]
         result = np.empty(math.prod(shape), object)
@@ -274,6 +279,11 @@ class Evaluation:
             return thread.select(operands[0], operands[2], operands[1])
         if name == "convert_element_type":
             return thread.convert(operands[0], params["new_dtype"])
+        if name == "bitcast_convert_type":
+            dtype = np.dtype(params["new_dtype"])
+            if dtype.itemsize != operands[0].dtype.itemsize or "b" in dtype.kind:
+                raise UnsupportedError("the bits of a number of another size")
+            return thread.bits(operands[0], dtype)
         if name == "integer_pow":
             return _power(thread, operands[0], params["y"])
         if name == "round":
@@ -500,33 +510,37 @@ class Evaluation:
                 has no place.
 
         Raises:
-            UnsupportedError: two of the indices are traced, or there are too many places.
+            UnsupportedError: there are too many places.
         """
         limits = [n - size for n, size in zip(shape, sizes, strict=True)]
-        traced = [
-            a
-            for a, (x, most) in enumerate(zip(starts, limits, strict=True))
-            if (most or not clamps) and not isinstance(x, np.generic)
-        ]
-        if len(traced) > 1:
-            raise UnsupportedError("a slice from several traced indices")
-        known = [int(x) if isinstance(x, np.generic) else 0 for x in starts]
-        within = [min(max(x, 0), most) for x, most in zip(known, limits, strict=True)]
-        if within != known and not clamps:
-            return []
-        if not traced:
-            return [(tuple(within), np.True_)]
-        (axis,) = traced
-        count = limits[axis] + 1
-        if count > self._max_places if self._repeating else count * math.prod(sizes) > MAX_LOADS:
-            raise UnsupportedError(f"a slice at one of {count} places")
-        index, places = starts[axis], []
-        for k in range(count):
-            # a start beyond the array moves to the nearest one within
-            name = "eq" if not clamps else "le" if k == 0 else "ge" if k == count - 1 else "eq"
-            flag = self.thread.apply(name, index, index.dtype.type(k))
-            places.append(((*within[:axis], k, *within[axis + 1 :]), flag))
+        axes: list[list[tuple[int, Any]]] = []
+        for index, most in zip(starts, limits, strict=True):
+            if isinstance(index, np.generic) or (clamps and not most):
+                known = int(index) if isinstance(index, np.generic) else 0
+                inside = min(max(known, 0), most)
+                axes.append([(inside, np.True_)] if clamps or inside == known else [])
+                continue
+            self._check_places(most + 1)
+            flags = []
+            for k in range(most + 1):
+                # a start beyond the array moves to the nearest one within
+                name = "eq" if not clamps else "le" if k == 0 else "ge" if k == most else "eq"
+                flags.append((k, self.thread.apply(name, index, index.dtype.type(k))))
+            axes.append(flags)
+        count = math.prod(map(len, axes))
+        if count > 1:
+            self._check_places(count * (1 if self._repeating else math.prod(sizes)))
+        places = []
+        for each in itertools.product(*axes):
+            flags = [flag for _, flag in each if isinstance(flag, Register)]
+            flag = self._combine("and", flags) if flags else np.True_
+            places.append((tuple(k for k, _ in each), flag))
         return places
+
+    def _check_places(self, count: int) -> None:
+        """Raises an UnsupportedError if a slice at a traced index has too many places."""
+        if count > (self._max_places if self._repeating else MAX_LOADS):
+            raise UnsupportedError(f"a slice at one of {count} places")
 
     def _slice(
         self, x: Entries, starts: Sequence[Any], sizes: Sequence[int], other: np.generic | None

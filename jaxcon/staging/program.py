@@ -48,6 +48,17 @@ REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
 }
 """The elementwise operation by which `by_halves` replaces each reduction over the first axes."""
 
+OF_NOTHING: dict[str, Callable[[Any], Any]] = {
+    "dot_general": lambda dtype: 0,
+    "reduce_sum": lambda dtype: 0,
+    "reduce_prod": lambda dtype: 1,
+    "reduce_max": lambda dtype: -np.inf if dtype.kind == "f" else jnp.iinfo(dtype).min,
+    "reduce_min": lambda dtype: np.inf if dtype.kind == "f" else jnp.iinfo(dtype).max,
+    "reduce_and": lambda dtype: True,
+    "reduce_or": lambda dtype: False,
+}
+"""The results of reductions of no entries, by dtype."""
+
 
 @dataclass
 class Operation:
@@ -356,6 +367,8 @@ class Program:
             equation: the equation.
             args: its operands.
         """
+        if not any(isinstance(x, Constant) for x in args):
+            return list(args)
         avals: list[Any] = [x.aval for x in (*equation.invars, *equation.outvars)]
         pairs = zip(args, avals, strict=False)
         moving = [y.shape for x, y in pairs if not isinstance(x, Constant)]
@@ -502,12 +515,14 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> Operand | None:
     """
     if len(equation.outvars) != 1:
         return None
-    name = equation.primitive.name
+    name, operands = equation.primitive.name, [x.aval for x in equation.invars]
     aval: Any = equation.outvars[0].aval
     if not is_known(aval.shape):  # a constant cannot have a symbolic size
         return None
     if 0 in aval.shape and not _is_key(aval):
         return uniform(0, aval)
+    if name in OF_NOTHING and 0 in operands[0].shape:
+        return uniform(OF_NOTHING[name](aval.dtype), aval)
     exponent = args[1] if name == "pow" and len(args) == 2 else None
     power = equation.params.get("y") if name == "integer_pow" else exponent
     if isinstance(power, Constant):
@@ -551,4 +566,5 @@ def _key(primitive: Primitive, params: dict[str, Any], args: list[Operand]) -> A
 
 def _is_key(x: Any) -> bool:
     """Returns True if x is a random key or another array of an extended dtype."""
-    return jnp.issubdtype(getattr(x, "dtype", np.float32), jax.dtypes.extended)
+    dtype = getattr(x, "dtype", None)
+    return not isinstance(dtype, np.dtype | None) and jnp.issubdtype(dtype, jax.dtypes.extended)
