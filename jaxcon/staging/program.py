@@ -515,7 +515,8 @@ def _known_result(equation: JaxprEqn, args: list[Operand]) -> Operand | None:
     """
     if len(equation.outvars) != 1:
         return None
-    name, operands = equation.primitive.name, [x.aval for x in equation.invars]
+    name = equation.primitive.name
+    operands: list[Any] = [x.aval for x in equation.invars]
     aval: Any = equation.outvars[0].aval
     if not is_known(aval.shape):  # a constant cannot have a symbolic size
         return None
