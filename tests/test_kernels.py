@@ -480,6 +480,8 @@ def at_index(x: Any, k: Any) -> Any:
         x.at[k, k - 1].get(mode="clip"),
         x.at[k, k - 1].set(5.0),
         x[:1].at[k].set(5.0),
+        x[0, 0].at[...].set(5.0) + x,
+        x[0, 0].at[...].add(5.0) + x,
         x.at[some + k].add(x[:2]),
         x.at[jnp.array([0, 9])].set(5.0),
     )
@@ -501,6 +503,9 @@ def of_nothing(x: Any) -> Any:
         jnp.min(none, 0, initial=3)[None] + x,
         jnp.any(none > 0) | (x > 0),
         jnp.all(none > 0, 0)[None] & (x > 0),
+        jnp.max(none > 0, initial=False) | (x > 0),
+        jnp.min(none > 0, initial=True) & (x > 0),
+        jax.lax.reduce_and(none.astype(jnp.int32), (0,))[None] + x.astype(jnp.int32),
         none.T @ none + x[:2],
     )
 

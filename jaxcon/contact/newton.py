@@ -12,9 +12,10 @@ laws and the equations of motion Nᵀ M N z = Nᵀ Jᵀ Λ are then the conditio
     min ½ zᵀ Nᵀ M N z + ℓ(J v).
 
 Newton's method with a line search solves it. Its matrix is Nᵀ (M + Jᵀ D J) N, with D = −∂Λ/∂(J v).
-After each full step the new Λ becomes the estimate Λ̂. A fixed point Λ = Λ̂ satisfies the laws of
+After a full step the new Λ becomes the estimate Λ̂. A fixed point Λ = Λ̂ satisfies the laws of
 `contact.bounded` for every R. A large R decides soon which rows act; once they no longer change, a
-smaller R lets Λ̂ converge in fewer steps, also with extreme ratios of masses.
+smaller R lets Λ̂ converge in fewer steps, also with extreme ratios of masses. With a small R, a
+step after which other rows act leaves Λ̂ as it was, and R grows again.
 
 References:
     Castro, Permenter, Han, An Unconstrained Convex Formulation of Compliant Contact, IEEE Trans.
@@ -64,7 +65,8 @@ SLOW = 0.5
 """The change of Λ̂ in a full step, relative to that of the step before, above which R shrinks."""
 
 SHRINK = 0.2
-"""The factor of R then. If other rows act after a step, R returns to `LEAST`."""
+"""The factor of R then. After a step that is not full, or after which other rows act, R returns to
+`LEAST` of its first value."""
 
 LEAST_IN_SINGLE, LEAST_IN_DOUBLE = 1e-3, 1e-6
 """The least product of all factors, by precision. A smaller R would be lost in rounding of Λ̂."""
@@ -201,7 +203,7 @@ class Laws(NamedTuple):
         return jnp.where(self.acts, λ, 0)
 
     def regimes(self, center: Array, velocity: Array) -> Array:
-        """Returns masks of the rows inside of their bounds, and of the discs that slide."""
+        """Returns flags: rows that are inside of their bounds, then discs that slide."""
         x, here = self.kinds.split(self.ahead(center, velocity)), self.kinds.split(center)
         pressed = jnp.maximum(here.normal, 0)
         flags = [x.single > 0, (x.box > self.lower) & (x.box < self.upper), x.normal > 0]
@@ -259,8 +261,8 @@ class State(NamedTuple):
         forces: Jᵀ Λ − M N z, minus the derivative of the objective, on bodies and on joints.
         going: True in worlds that are not done, ().
         ease: the factor of R, (1,).
-        moved: the change of Λ̂ in the last full step, as the largest velocity SHARE g |ΔΛ̂|, () [m/s,
-            rad/s].
+        moved: the change of Λ by the last full step after the first `PATIENCE` iterations, as the
+            largest velocity SHARE g |ΔΛ|, () [m/s, rad/s]; infinite before.
     """
 
     iteration: Array

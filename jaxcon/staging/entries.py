@@ -54,13 +54,13 @@ MAX_UNROLLED = 50_000
 """The largest number of instructions of such a loop, if it can be written as a loop."""
 
 MAX_ITERATED = 1000
-"""The largest number of instructions of such a loop whose rounds are all the same.
+"""The same for a loop that reads and writes no rows, and counts no rounds.
 
-Nothing in them is known better round by round.
+Round by round, nothing in it is known better.
 """
 
 MAX_CHOSEN = 64
-"""The largest number of known entries of which each round of a loop reads a row.
+"""The largest number of entries that are not in memory, of which each round of a loop reads a row.
 
 The row is chosen by its index among all rows.
 """
@@ -509,6 +509,10 @@ class Evaluation:
             clamps: True to move a slice beyond the array to the nearest place within. Otherwise it
                 has no place.
 
+        Returns:
+            Pairs of a start and a flag, which is `np.True_` if the place is certain. One flag
+            holds if `clamps` is True, otherwise one at most.
+
         Raises:
             UnsupportedError: there are too many places.
         """
@@ -521,12 +525,12 @@ class Evaluation:
                 axes.append([(inside, np.True_)] if clamps or inside == known else [])
                 continue
             self._check_places(most + 1)
-            flags = []
+            pairs = []
             for k in range(most + 1):
                 # a start beyond the array moves to the nearest one within
                 name = "eq" if not clamps else "le" if k == 0 else "ge" if k == most else "eq"
-                flags.append((k, self.thread.apply(name, index, index.dtype.type(k))))
-            axes.append(flags)
+                pairs.append((k, self.thread.apply(name, index, index.dtype.type(k))))
+            axes.append(pairs)
         count = math.prod(map(len, axes))
         if count > 1:
             self._check_places(count * (1 if self._repeating else math.prod(sizes)))
@@ -622,7 +626,7 @@ class Evaluation:
         inner = list(numbers.update_window_dims)
         outer = [a for a in range(updates.ndim) if a not in inner]
         moved = np.transpose(updates, [*outer, *inner])
-        clamps = params["mode"] != jax.lax.GatherScatterMode.FILL_OR_DROP
+        clamps = params["mode"] == jax.lax.GatherScatterMode.CLIP
         for place in np.ndindex(moved.shape[: len(outer)]):
             new = np.expand_dims(moved[(*place, ...)], tuple(numbers.inserted_window_dims))
             starts = _starts(numbers.scatter_dims_to_operand_dims, indices[place], x.ndim)
@@ -734,7 +738,7 @@ def _contracted(x: Entries, summed: Sequence[int], batch: Sequence[int]) -> Entr
 
 
 def _counts(body: Body, constants: int) -> bool:
-    """Returns whether a loop carries a number to which each round adds a known one.
+    """Returns whether a loop carries an integer to which each round adds something.
 
     Args:
         body: the body of the loop.
@@ -795,9 +799,10 @@ def _pad(params: Mapping[str, Any], x: Entries, value: Entries) -> Entries:
     return padded[tuple(cut)]
 
 
-def _window(start: Sequence[int], sizes: Sequence[int]) -> tuple[slice, ...]:
-    """Returns the slices of each axis that begin at `start`."""
-    return tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))
+def _window(start: Sequence[int], sizes: Sequence[int]) -> tuple[Any, ...]:
+    """Returns the slices of each axis that begin at `start`; an array has no other axes."""
+    # with an ellipsis, NumPy returns an array of rank 0 as an array
+    return (*(slice(a, a + n) for a, n in zip(start, sizes, strict=True)), ...)
 
 
 def _starts(axes: Sequence[int], indices: Entries, rank: int) -> list[Any]:

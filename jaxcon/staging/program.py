@@ -48,14 +48,29 @@ REDUCTIONS: dict[str, Callable[[Array, Array], Array]] = {
 }
 """The elementwise operation by which `by_halves` replaces each reduction over the first axes."""
 
+
+def _least(dtype: Any) -> Any:
+    """Returns the least number of a dtype."""
+    if dtype.kind == "b":
+        return False
+    return -np.inf if jnp.issubdtype(dtype, jnp.floating) else jnp.iinfo(dtype).min
+
+
+def _largest(dtype: Any) -> Any:
+    """Returns the largest number of a dtype."""
+    if dtype.kind == "b":
+        return True
+    return np.inf if jnp.issubdtype(dtype, jnp.floating) else jnp.iinfo(dtype).max
+
+
 OF_NOTHING: dict[str, Callable[[Any], Any]] = {
     "dot_general": lambda dtype: 0,
     "reduce_sum": lambda dtype: 0,
     "reduce_prod": lambda dtype: 1,
-    "reduce_max": lambda dtype: -np.inf if dtype.kind == "f" else jnp.iinfo(dtype).min,
-    "reduce_min": lambda dtype: np.inf if dtype.kind == "f" else jnp.iinfo(dtype).max,
-    "reduce_and": lambda dtype: True,
-    "reduce_or": lambda dtype: False,
+    "reduce_max": _least,
+    "reduce_min": _largest,
+    "reduce_and": lambda dtype: ~dtype.type(0),  # all bits are set
+    "reduce_or": lambda dtype: 0,
 }
 """The results of reductions of no entries, by dtype."""
 
