@@ -306,6 +306,8 @@ def test_what_has_no_end_has_no_trace_of_events(monkeypatch):
     texts = [program(system, state, method) for method in (events, jc.Method())]
     assert texts[0] == texts[1]  # the same kernel
     monkeypatch.setenv("JAXCON_KERNELS", "off")  # branches of kernels are not in the text of XLA
+    sizes = [len(program(system, state, method)) for method in (events, jc.Method())]
+    assert sizes[0] == sizes[1]
     branches = [
         [program(*built, method).count("stablehlo.case") for method in (events, jc.Method())]
         for built in (falling(), (system, state))

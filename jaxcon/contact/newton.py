@@ -202,16 +202,6 @@ class Laws(NamedTuple):
         )
         return jnp.where(self.acts, λ, 0)
 
-    def regimes(self, center: Array, velocity: Array) -> Array:
-        """Returns flags: rows that are inside of their bounds, then discs that slide."""
-        x, here = self.kinds.split(self.ahead(center, velocity)), self.kinds.split(center)
-        pressed = jnp.maximum(here.normal, 0)
-        flags = [x.single > 0, (x.box > self.lower) & (x.box < self.upper), x.normal > 0]
-        for disc, μ, y in zip(self.kinds.discs, self.coefficients, x.discs, strict=True):
-            if len(y):
-                flags.append(numerics.norm(y) > μ * disc.of(pressed))
-        return jnp.concatenate(flags)
-
     def slope(self, center: Array, velocity: Array) -> tuple[Array, list[tuple[Array, Vector]]]:
         """Returns −∂λ/∂u: its diagonal part a, (n,), and for each disc b and t of −b t tᵀ."""
         stiff = jnp.where(self.acts, 1 / (self.regularization + self.compliance), 0)
@@ -247,6 +237,11 @@ class Laws(NamedTuple):
 
 Momentum = tuple[ByBranch, ByBranch]
 """M N z of the bodies, and that of rotors on joints, by branch."""
+
+
+def regimes(diagonal: Array, discs: list[tuple[Array, Vector]]) -> Array:
+    """Returns flags, from `Laws.slope`: rows inside of their bounds, then discs that slide."""
+    return jnp.concatenate([diagonal > 0, *(b > 0 for b, _ in discs)])
 
 
 class State(NamedTuple):
@@ -353,7 +348,7 @@ class Problem(NamedTuple):
             return is_whole, jnp.where(is_whole, shrunk, state.ease), state.moved
 
         def late() -> tuple[Array, Array, Array]:
-            before, after = (laws.regimes(state.center, x) for x in (state.velocity, velocity))
+            before, after = regimes(diagonal, discs), regimes(*laws.slope(state.center, velocity))
             settled = is_whole & jnp.all(before == after, axis=0)
             moved = jnp.max(self.laws.regularization * jnp.abs(new - state.center), axis=0)
             # where the same rows act as before, only Λ̂ is left to converge, faster with small R

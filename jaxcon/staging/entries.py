@@ -54,9 +54,9 @@ MAX_UNROLLED = 50_000
 """The largest number of instructions of such a loop, if it can be written as a loop."""
 
 MAX_ITERATED = 1000
-"""The same for a loop that reads and writes no rows, and counts no rounds.
+"""The largest number of instructions of an unrolled loop whose rounds are all alike.
 
-Round by round, nothing in it is known better.
+Such a loop reads and writes no rows and counts no rounds, so that unrolling makes nothing known.
 """
 
 MAX_CHOSEN = 64

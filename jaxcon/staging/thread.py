@@ -42,7 +42,7 @@ class UnsupportedError(Exception):
 
 
 class _TooLongError(Exception):
-    """What a thread writes on trial is too long."""
+    """A trial of `Thread.tried` exceeds its largest number of instructions."""
 
 
 @dataclass(frozen=True, slots=True)
