@@ -1,6 +1,7 @@
 """Large batches are simulated in chunks of worlds, with the same values and derivatives."""
 
 import dataclasses
+import itertools
 from functools import partial
 
 import jax
@@ -13,6 +14,7 @@ import jaxcon as jc
 from benchmarks import large_batches
 from jaxcon.execution import rollout
 from jaxcon.staging import chunks
+from jaxcon.staging.operations import inside
 
 MOST = 4
 STEPS = 5
@@ -292,3 +294,19 @@ def test_reverse_mode_keeps_residuals_and_forward_mode_does_not():
     ]
     assert results[0][0] > 2
     assert results[1] == [2, 2]  # values, and tangents
+
+
+def natives(jaxpr):
+    """The calls of native functions in a jaxpr and in its loops."""
+    for e in jaxpr.eqns:
+        yield from (
+            [e] if e.primitive.name == "native" else itertools.chain(*map(natives, inside(e)))
+        )
+
+
+def test_what_is_not_recorded_is_not_computed_in_chunks(few):
+    """The results of a step are its state, and an info that no one reads here."""
+    traced = jax.make_jaxpr(jax.vmap(swung))(jnp.ones(9), jnp.ones(9)).jaxpr
+    (chunk,) = (e for e in traced.eqns if e.primitive is chunks.worlds_p)
+    (step,) = natives(chunk.params["jaxpr"].jaxpr)
+    assert len(step.outvars) == len(jax.tree.leaves(STATE))

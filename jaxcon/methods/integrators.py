@@ -419,31 +419,39 @@ class RungeKutta(checks.Checked, Integrator):
     def advance(self, dynamics: Dynamics, state: State, memory: PyTree, dt: Array) -> Advanced:
         """Advances a state by one step of dt [s]."""
         q, v, t, h = state.q, state.v, state.instant, dt[None]
-        system = dynamics.system
-        solution, rows, dynamics = dynamics.at_step_start(q, v, t)
-        first = system.kinematics(q, v), solution.acceleration
+        system, put = dynamics.system, jax.lax.dynamic_update_index_in_dim
 
-        def stage(carry: Carry, row: tuple[Array, Array]) -> tuple[Carry, None]:
+        def stage(carry: Carry, row: tuple[Array, Array]) -> tuple[Carry, tuple[Solution, Rows]]:
             (slopes, code), (weights, i) = carry, row
             dq, dv = (combine(weights, x) for x in slopes)
             q_i, v_i = system.normalize(q + h * dq), v + h * dv
-            (a, _, stage_code), _ = dynamics(q_i, v_i, t + dt * jnp.sum(weights))
-            put = jax.lax.dynamic_update_index_in_dim
-            pairs = zip(slopes, (system.kinematics(q_i, v_i), a), strict=True)
-            return (tuple(put(x, y, i, 0) for x, y in pairs), status.first(code, stage_code)), None
+            solution, rows = dynamics(q_i, v_i, t + dt * jnp.sum(weights))
+            pairs = zip(slopes, (system.kinematics(q_i, v_i), solution.acceleration), strict=True)
+            slopes = tuple(put(x, y, i, 0) for x, y in pairs)
+            return (slopes, status.first(code, solution.status)), (solution, rows)
 
-        slopes = tuple(jnp.zeros((len(self.b), *x.shape), x.dtype).at[0].set(x) for x in first)
-        table = np.zeros((len(self.a), len(self.b)))
-        for i, weights in enumerate(self.a):
-            table[i, : i + 1] = weights
-        inputs = jnp.asarray(table, q.dtype), jnp.arange(1, len(self.b))
-        carry = slopes, solution.status
+        count = len(self.b)
+        table = np.zeros((count, count))
+        for i, row in enumerate(self.a):
+            table[i + 1, : i + 1] = row
+        weights, numbers = jnp.asarray(table, q.dtype), jnp.arange(count)
+        slopes = tuple(jnp.zeros((count, *x.shape), x.dtype) for x in (q, v))
+        carry: Carry = slopes, jnp.zeros_like(state.status)
+        begun: list[tuple[Solution, Rows]] = []
+        if dynamics.contact is not None:  # its forces are solved for in the first stage only
+            solution, rows, dynamics = dynamics.at_step_start(q, v, t)
+            first = system.kinematics(q, v), solution.acceleration
+            slopes = tuple(x.at[0].set(y) for x, y in zip(slopes, first, strict=True))
+            carry, begun = (slopes, solution.status), [(solution, rows)]
+            weights, numbers = weights[1:], numbers[1:]
         if checks.is_concrete((q, v)):  # outside a trace, the user's functions get concrete values
-            for row in zip(*inputs, strict=True):
-                carry, _ = stage(carry, row)
+            for row in zip(weights, numbers, strict=True):
+                carry, solved = stage(carry, row)
+                begun.append(solved)
         else:
-            carry, _ = jax.lax.scan(stage, carry, inputs)
-        slopes, code = carry
+            carry, solved = jax.lax.scan(stage, carry, (weights, numbers))
+            begun = begun or [jax.tree.map(lambda x: x[0], solved)]
+        (slopes, code), (solution, rows) = carry, begun[0]
         dq, dv = (combine(self.b, x) for x in slopes)
         q, v = system.normalize(q + h * dq), v + h * dv
         if (jump := rows.jump) is not None:

@@ -298,21 +298,26 @@ class Projection(checks.Checked, Stabilizer):
             off = (left > stays) & ((left < before) | (left > fails))
             return off & ~status.failed(state.status)
 
-        def iterate(function: roots.Operator, d: Array) -> tuple[Array, Array]:
+        def iterate(function: roots.Operator, d: Array) -> tuple[Array, tuple[Array, Array]]:
             def wanted(carry: tuple[Array, ...]) -> Array:
-                count, _, left, before = carry
-                return (count < self.iterations) & somewhere(goes(largest(left), before))
+                count, _, left, before, _ = carry
+                going = somewhere(goes(largest(left), before))
+                # the first iteration tells if the factorization has failed
+                return (count < self.iterations) & (going | (count == 0))
 
             def once(carry: tuple[Array, ...]) -> tuple[Array, ...]:
-                count, d, left, before = carry
+                count, d, left, before, code = carry
                 most = largest(left)
-                new = d - factor * solve(left).acceleration
-                d = jnp.where(goes(most, before)[None], new, d)
-                return count + 1, d, residual(d), most
+                solution = solve(left)
+                d = jnp.where(goes(most, before)[None], d - factor * solution.acceleration, d)
+                code = status.first(code, status.failures(solution.status))
+                return count + 1, d, residual(d), most, code
 
-            first = (jnp.zeros((), jnp.int32), d, φ, largest(φ) + jnp.inf)
-            _, d, left, _ = jax.lax.while_loop(wanted, once, first)
-            return d, left
+            none = jnp.zeros_like(state.status)
+            first = (jnp.zeros((), jnp.int32), d, φ, largest(φ) + jnp.inf, none)
+            _, d, left, _, code = jax.lax.while_loop(wanted, once, first)
+            # `custom_root` has no derivatives of integers
+            return d, (left, code.astype(left.dtype))
 
         def equation(d: Array) -> Array:
             """Returns the residual d − S (J₀ d − φ(q* ⊕ d)) of a displacement d from q*.
@@ -334,9 +339,9 @@ class Projection(checks.Checked, Stabilizer):
             left = φ if self.tolerance is None else residual(d)
             code = jnp.where(met, Status.OK, code)
         else:
-            d, left = roots.implicit(equation, still, iterate, self.iterations)
-            # a status of the factorization; `left` is the residual of the iterations
-            code = solve(0 * φ).status
+            d, (left, code) = roots.implicit(equation, still, iterate, self.iterations)
+            # `left` decides if the iterations have converged
+            code = jnp.where(code == Status.NOT_CONVERGED, Status.OK, code).astype(jnp.int32)
         late = jnp.where(largest(left) > fails, Status.NOT_CONVERGED, Status.OK)
         code = status.first(status.failures(code), late.astype(jnp.int32))
         if not coupled:

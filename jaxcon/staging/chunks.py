@@ -64,7 +64,9 @@ class OneWorld:
     """
 
     def __init__(self, closed: ClosedJaxpr, chunk_size: int) -> None:
-        self.closed, self.chunk_size = closed, chunk_size
+        # the loops of a rollout compute what no one reads, such as infos that are not recorded
+        self.closed = ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
+        self.chunk_size = chunk_size
         self.results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.out_avals]
         self.arguments = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.in_avals]
         self.tangent = functools.lru_cache(maxsize=16)(self._tangent)

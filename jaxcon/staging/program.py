@@ -285,6 +285,10 @@ class Program:
         If the equation calls a function, the operations of the function are appended instead.
         """
         name, params = equation.primitive.name, equation.params
+        if name in BINARY:
+            result = self._append_arithmetic(equation, args)
+            if result is not None:
+                return result
         operands: list[Any] = [x.aval for x in equation.invars]
         inner = called(equation)
         if inner is not None:
@@ -322,6 +326,31 @@ class Program:
             given = [args[0], *(x for x in args[1:] if not isinstance(x, Constant))]
             return self._emit(equation, params | {"branches": branches}, given, all(plain))
         return self._emit(equation, params, args, True)
+
+    def _append_arithmetic(self, equation: JaxprEqn, args: list[Operand]) -> list[Any] | None:
+        """Appends most operations of a step, those on two operands that are not constant.
+
+        It does for them what `_append` does for all equations. It returns None for others, and for
+        results without entries.
+        """
+        first, second = args
+        aval: Any = equation.outvars[0].aval
+        if isinstance(first, Constant) or isinstance(second, Constant):
+            return None
+        if not all(type(n) is int and n for n in aval.shape):
+            return None
+        primitive, params = equation.primitive, equation.params
+        swaps = second < first and primitive.name in COMMUTATIVE
+        key = primitive, tuple(params.items()), (second, first) if swaps else (first, second)
+        if key not in self._known:
+            outputs = [self._new(equation.outvars[0])]
+            fixed = first in self._fixed and second in self._fixed
+            if fixed:
+                self._fixed.update(outputs)
+            op = Operation(primitive, params, args, outputs, True, False, fixed)
+            self.operations.append(op)
+            self._known[key] = outputs
+        return self._known[key]
 
     def _append_while(self, equation: JaxprEqn, args: list[Operand]) -> list[Operand]:
         """Appends a loop with a condition, which is outside of kernels, maybe on all devices."""
