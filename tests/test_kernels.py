@@ -574,9 +574,24 @@ def test_operations(platform, function, args):
     check_operations(platform, function, args)
 
 
-@pytest.mark.parametrize("function", [scanned, repeated, reduced, at_each, by_table, iterated])
+def held(x):
+    """A loop whose rows are read afterwards: numbers, flags and whole numbers of each round."""
+
+    def visit(carry, row):
+        carry = jnp.sin(carry) + row
+        return carry, (carry[0] * x, carry > 0.3, jnp.sum(carry > 0, dtype=jnp.int32))
+
+    last, (numbers, flags, places) = jax.lax.scan(
+        visit, x[0], jnp.asarray([0.5, -1.0, 2.0], x.dtype)
+    )
+    return last, numbers[1] - numbers[2].sum(), flags[0] ^ flags[2], places[::-1] + 1, numbers
+
+
+@pytest.mark.parametrize(
+    "function", [scanned, repeated, reduced, at_each, by_table, iterated, held]
+)
 def test_loops_that_are_not_written_round_by_round(platform, function, monkeypatch):
-    for limit in ("MAX_UNROLLED", "MAX_ITERATED"):
+    for limit in ("MAX_UNROLLED", "MAX_UNROLLED_HELD", "MAX_ITERATED"):
         monkeypatch.setattr(entries, limit, 0)
     check_operations(platform, function, (ARRAY,))
 

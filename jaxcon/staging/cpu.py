@@ -35,7 +35,7 @@ OPTIMIZATION = 1
 class Cpu:
     """The CPU of this machine; see `Platform`."""
 
-    max_length = 400_000
+    max_length = 800_000
     max_arrays = 10_000
     max_places = 24
 

@@ -50,8 +50,11 @@ PLACINGS = ("mesh_cast", "pvary", "reshard", "sharding_constraint")
 MAX_ROUNDS = 64
 """The largest number of rounds of a loop that is written round by round."""
 
-MAX_UNROLLED = 50_000
+MAX_UNROLLED = 30_000
 """The largest number of instructions of such a loop, if it can be written as a loop."""
+
+MAX_UNROLLED_HELD = 100_000
+"""The same, if rows that the rounds write are read later: a loop holds them all in registers."""
 
 MAX_ITERATED = 1000
 """The largest number of instructions of an unrolled loop whose rounds are all alike.
@@ -64,6 +67,9 @@ MAX_CHOSEN = 64
 
 The row is chosen by its index among all rows.
 """
+
+MAX_HELD = 4096
+"""The largest number of entries that all rounds of a loop write to registers."""
 
 MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
@@ -410,13 +416,19 @@ class Evaluation:
             x if flag else None for x, flag in zip(rows, used[constants + carries :], strict=True)
         ]
         places = sinks[carries:]
-        repeats = length > 1 and all(places) and not params["reverse"] and self._fit(rows)
-        if length > MAX_ROUNDS and repeats:
+        held = [
+            math.prod(x.aval.shape)
+            for x, place in zip(body.closed.jaxpr.outvars[carries:], places, strict=True)
+            if not place
+        ]
+        fits = self._fit(rows) and (not held or length * sum(held) <= MAX_HELD)
+        repeats = length > 1 and fits and not params["reverse"]
+        if length > MAX_ROUNDS and repeats and not held:
             return self._repeat(body, fixed, carried, rows, places, length)
         if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
         same = not any(x is not None for x in rows) and not places and not _counts(body, constants)
-        limit = MAX_ITERATED if same else MAX_UNROLLED
+        limit = MAX_ITERATED if same else MAX_UNROLLED_HELD if held else MAX_UNROLLED
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
 
@@ -455,14 +467,23 @@ class Evaluation:
             fixed: its first arguments, the same in all rounds.
             start: the carried values at the start.
             rows: arrays of which each round reads a row; None if the body does not read it.
-            places: arrays of which each round writes a row.
+            places: arrays of which each round writes a row; None for rows that are held in
+                registers.
             length: the number of rounds.
         """
-        shapes = [x.shape for x in start]
         kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
+        written = [x.aval for x in body.closed.jaxpr.outvars[len(start) :]]
         before = self.thread.length + self._extra
-        # a register that counts the rounds, if one of them reads a row of known or computed numbers
-        count = [np.int32(0)] if any(isinstance(x, np.ndarray) for x in rows) else []
+        held = [
+            entries(np.zeros((length, *x.shape), x.dtype))
+            for x, place in zip(written, places, strict=True)
+            if not place
+        ]
+        carried = [*start, *held]
+        shapes = [x.shape for x in carried]
+        # a register that counts the rounds, if one of them reads or writes a row of registers
+        counts = bool(held) or any(isinstance(x, np.ndarray) for x in rows)
+        count = [np.int32(0)] if counts else []
 
         def run(counter: Counter, carried: Sequence[Scalar]) -> list[Scalar]:
             index, numbers = carried[: len(count)], carried[len(count) :]
@@ -470,21 +491,37 @@ class Evaluation:
                 self._chosen(x, index[0]) if isinstance(x, np.ndarray) else _row(x, counter, aval)
                 for x, aval in zip(rows, kinds, strict=True)
             ]
-            results = self(body, [*fixed, *_unflattened(numbers, shapes), *given])
+            arrays = _unflattened(numbers, shapes)
+            results = self(body, [*fixed, *arrays[: len(start)], *given])
+            kept = iter(arrays[len(start) :])
+            following = results[: len(start)]
             for x, place in zip(results[len(start) :], places, strict=True):
-                place.row(counter).write(x)
-            following = [self.thread.apply("add", x, np.int32(1)) for x in index]
-            return [*following, *_flat(results[: len(start)])]
+                if place:
+                    place.row(counter).write(x)
+                else:
+                    following.append(self._with_row(next(kept), x, index[0]))
+            return [*(self.thread.apply("add", x, np.int32(1)) for x in index), *_flat(following)]
 
         outside, self._repeating = self._repeating, True
         try:
-            final = self.thread.repeat(length, run, [*count, *_flat(start)])[len(count) :]
+            final = self.thread.repeat(length, run, [*count, *_flat(carried)])[len(count) :]
         finally:
             self._repeating = outside
         self._extra += (self.thread.length + self._extra - before) * (length - 1)
         if self._extra > MAX_WORK:
             raise UnsupportedError(f"a loop of {length} rounds, which would take too long")
-        return [*_unflattened(final, shapes), *places]
+        arrays = _unflattened(final, shapes)
+        kept = iter(arrays[len(start) :])
+        return [*arrays[: len(start)], *(place or next(kept) for place in places)]
+
+    def _with_row(self, rows: Entries, x: Entries, index: Any) -> Entries:
+        """Writes the replacement of the row at an index by x."""
+        result: Any = rows.copy()
+        for k in range(len(rows)):
+            here = self.thread.apply("eq", index, np.int32(k))
+            for i in np.ndindex(x.shape):
+                result[k, *i] = self.thread.select(here, x[i], result[k, *i])
+        return result
 
     def _fit(self, rows: Sequence[Any]) -> bool:
         """Returns whether each round of a loop can read its rows of these arrays."""

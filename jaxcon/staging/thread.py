@@ -24,7 +24,7 @@ from jaxcon.core.host import ELEMENTWISE
 from jaxcon.core.typing import T
 from jaxcon.staging.constants import NEUTRAL
 
-MAX_REGISTERS = 600_000
+MAX_REGISTERS = 1_000_000
 """The largest number of registers that a thread may name, so that writing ends in seconds."""
 
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64", "bool")}
