@@ -516,11 +516,12 @@ class Evaluation:
 
     def _with_row(self, rows: Entries, x: Entries, index: Any) -> Entries:
         """Writes the replacement of the row at an index by x."""
-        result: Any = rows.copy()
+        result = rows.copy()
+        new: Any = x
         for k in range(len(rows)):
             here = self.thread.apply("eq", index, np.int32(k))
             for i in np.ndindex(x.shape):
-                result[k, *i] = self.thread.select(here, x[i], result[k, *i])
+                result[(k, *i)] = self.thread.select(here, new[i], result[(k, *i)])
         return result
 
     def _fit(self, rows: Sequence[Any]) -> bool:
