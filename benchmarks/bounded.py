@@ -1,7 +1,7 @@
 """Cost and residuals of contact solvers, by solver and number of iterations.
 
     python -m benchmarks.bounded [--worlds 256] [--scenes box chain column]
-    python -m benchmarks.bounded --laws 100000 [--scenes box chain]
+    python -m benchmarks.bounded --laws 100000 [--scenes box chain] [--regularization 0.0253]
 
 Each run takes one step from random states of a scene. The states are a batch on one device. There
 are three scenes:
@@ -136,6 +136,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=256)
     parser.add_argument("--laws", type=int, nargs="?", const=1000, help="number of random states")
+    parser.add_argument("--regularization", type=float, help="of the laws of `--laws`")
     parser.add_argument("--scenes", nargs="*", default=list(SCENES))
     parser.add_argument("--dtypes", nargs="*", default=["float32", "float64"])
     options = parser.parse_args()
@@ -144,7 +145,11 @@ def main() -> None:
     if options.laws:
         from benchmarks import laws
 
-        laws.table(options.scenes, options.dtypes, options.laws)
+        given = options.scenes, options.dtypes, options.laws
+        if options.regularization is None:
+            laws.table(*given)
+        else:
+            laws.regularized_table(*given, options.regularization)
         return
     print("| scene | | | residual, median | 99 % | worst | µs a step and world | compile |")
     for name in options.scenes:

@@ -183,6 +183,52 @@ def beyond(violations: Laws, dtype: DTypeLike) -> Laws:
     return Laws(*(int(np.sum(~(x <= y))) for x, y in zip(violations, bounds, strict=True)))
 
 
+REGULARIZED = {
+    "Newton": jc.solvers.Newton,
+    "GaussSeidel(30)": jc.solvers.GaussSeidel,
+    "InteriorPoint(30)": OneProblem,
+}
+"""The solvers of `regularized_table`."""
+
+
+def step_of(name: str, dtype: DTypeLike, solver: Any, worlds: int) -> tuple[Any, Any]:
+    """Returns v after a step from random states, (worlds, n_v), and the residual, (worlds,).
+
+    Both are divided by the largest initial velocity.
+    """
+    build, draw = SCENES[name]
+    system, state = build(dtype)
+    method, h = jc.Method(contact_solver=solver), jnp.asarray(STEP, dtype)
+    initial = jc.init(system, method, state.q, state.v)
+
+    def one(key: jax.Array) -> tuple[Any, Any]:
+        start = draw(key, system, initial)
+        new, info = jc.step(system, method, start, None, h)
+        speed = jnp.max(jnp.abs(start.v))
+        return new.v / speed, info.reactions.residual / speed
+
+    run = jax.jit(jax.vmap(one))
+    keys = jax.random.split(jax.random.PRNGKey(0), worlds)
+    blocks = [run(keys[i : i + BLOCK]) for i in range(0, worlds, BLOCK)]
+    v, residual = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    return v, residual
+
+
+def regularized_table(scenes: list[str], dtypes: list[str], worlds: int, share: float) -> None:
+    """Prints how far regularized steps miss their laws, and their distance from exact ones."""
+    print(f"{worlds} states, regularization {share:.3g}; median / 99 % / worst")
+    print("| scene | | | laws of its own | distance from the exact laws |\n|---|---|---|---|---|")
+    for name in scenes:
+        for dtype in dtypes:
+            exact, _ = step_of(name, jnp.dtype(dtype), OneProblem(), worlds)
+            for label, solver in REGULARIZED.items():
+                v, residual = step_of(name, jnp.dtype(dtype), solver(regularization=share), worlds)
+                numbers = residual, np.max(np.abs(v - exact), axis=1)
+                shown = (np.quantile(x, [0.5, 0.99, 1.0]) for x in numbers)
+                cells = " | ".join(" / ".join(f"{y:.0e}" for y in x) for x in shown)
+                print(f"| {name} | {dtype} | {label} | {cells} |", flush=True)
+
+
 def table(scenes: list[str], dtypes: list[str], worlds: int) -> None:
     """Prints a table of law violations by scene, precision and solver."""
     print(f"{worlds} states; median / 99 % / worst (states beyond {ALLOWED})")

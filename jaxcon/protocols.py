@@ -626,6 +626,11 @@ class ContactSolver(TreeNode, Protocol):
         """The width of rounded corners of the rows' laws, for derivatives only [m/s, rad/s]."""
         return None
 
+    @property
+    def regularization(self) -> Scalar | None:
+        """The least compliance of rows, as a share of the inverse mass that they meet."""
+        return None
+
     def check(self) -> None:
         """Checks the numbers of the solver.
 

@@ -31,6 +31,7 @@ class GaussSeidel(checks.Checked, ContactSolver):
         sweeps: number of sweeps in a step.
         warm: True to start from the multipliers of the last step.
         smoothing: width of the smoothed corners of the laws, for the derivative only [m/s, rad/s].
+        regularization: the least compliance of a row, see `Newton`; None for exact laws.
 
     References:
         Jourdan, Alart, Jean, A Gauss–Seidel like algorithm to solve frictional contact problems,
@@ -40,6 +41,7 @@ class GaussSeidel(checks.Checked, ContactSolver):
     sweeps: int = static(default=30)
     warm: bool = static(default=True)  # type: ignore[override]
     smoothing: Any = None
+    regularization: Any = None
     # a landing without restitution is split between two steps, see `landing`
     exact = False  # type: ignore[assignment]
 
@@ -47,12 +49,15 @@ class GaussSeidel(checks.Checked, ContactSolver):
         """Checks the number of sweeps, the warm start and the smoothing.
 
         Raises:
-            ValueError: `sweeps` is not a positive integer, `warm` is not a bool, or `smoothing` is
-                negative.
+            ValueError: `sweeps` is not a positive integer, `warm` is not a bool, or `smoothing` or
+                `regularization` is negative.
         """
         checks.count("GaussSeidel", "sweeps", self.sweeps)
         checks.flag("GaussSeidel", "warm", self.warm)
         checks.check("GaussSeidel", "smoothing", self.smoothing, (), least=0, optional=True)
+        checks.check(
+            "GaussSeidel", "regularization", self.regularization, (), least=0, optional=True
+        )
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """Returns the multipliers λ, (n,), after sweeps from an initial guess, (n,)."""

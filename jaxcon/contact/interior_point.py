@@ -51,6 +51,7 @@ class InteriorPoint(checks.Checked, ContactSolver):
             these steps do not suffice, as many further rounds unload redundant contacts, such as
             one of the four corners of a face.
         smoothing: width of the smoothed corners of the laws, for the derivative only [m/s, rad/s].
+        regularization: the least compliance of a row, see `Newton`; None for exact laws.
 
     References:
         Howell, Le Cleac'h, Kolter, Schwager, Manchester, Dojo: a differentiable physics engine for
@@ -61,6 +62,7 @@ class InteriorPoint(checks.Checked, ContactSolver):
     iterations: int = static(default=30)
     polish: int = static(default=12)
     smoothing: Any = None
+    regularization: Any = None
     warm = False  # type: ignore[assignment]
     # so a landing without restitution is resolved as an impact within the step
     exact = True  # type: ignore[assignment]
@@ -74,6 +76,9 @@ class InteriorPoint(checks.Checked, ContactSolver):
         checks.count("InteriorPoint", "iterations", self.iterations)
         checks.count("InteriorPoint", "polish", self.polish, 0)
         checks.check("InteriorPoint", "smoothing", self.smoothing, (), least=0, optional=True)
+        checks.check(
+            "InteriorPoint", "regularization", self.regularization, (), least=0, optional=True
+        )
 
     def solve(self, problem: Bounded, start: Array) -> Array:
         """Returns the multipliers λ, (n,); `start` is not used."""

@@ -22,6 +22,7 @@ from jaxcon.contact.bounded import (
     implicit_solution,
     laws,
     probes,
+    regularized,
 )
 from jaxcon.contact.nearest_rows import ActiveSet
 from jaxcon.contact.newton import Newton
@@ -265,9 +266,9 @@ class ContactProblem:
         movable = self.movable(matrix)
         free = self.end_velocity(self.start)
         soft = jnp.where(movable[None] & movable[:, None], matrix, 0)
-        soft = jax.lax.stop_gradient(
-            soft + rows.compliance[None] * gauss_jordan.identity(rows.rate)
-        )
+        scale = rows.kinds.largest(gauss_jordan.diagonal(soft))
+        compliance = regularized(rows.compliance, rows.kinds, scale, solver.regularization)
+        soft = jax.lax.stop_gradient(soft + compliance[None] * gauss_jordan.identity(rows.rate))
 
         def met(wanted: Array) -> tuple[Array, Array]:
             offset = jax.lax.stop_gradient(jnp.where(movable, free - wanted, 0))
@@ -278,7 +279,7 @@ class ContactProblem:
             solution = jnp.where(movable, solver.solve(problem, start), 0)
 
             def moved(multipliers: Array) -> Array:
-                here = self.velocity(multipliers) + rows.compliance * multipliers - wanted
+                here = self.velocity(multipliers) + compliance * multipliers - wanted
                 return jnp.where(movable, here, 0)
 
             live = (rows.lower, rows.upper, (rows.friction, *rows.resistance))
@@ -303,13 +304,14 @@ class ContactProblem:
                 space, fixed, offset, start, self.acts, self.bare, self.dt, solver
             )
             scale = jnp.where(self.dt > 0, self.dt, 1)[None] * mass
+            compliance = regularized(rows.compliance, rows.kinds, scale, solver.regularization)
 
             def moved(multipliers: Array) -> Array:
-                here = self.velocity(multipliers) + rows.compliance * multipliers - wanted
+                here = self.velocity(multipliers) + compliance * multipliers - wanted
                 return jnp.where(movable, here, 0)
 
             def inverses(bounds: Limits, corner: Array | None, u: Array) -> Inverses:
-                numbers = scale, fixed.compliance, movable, self.dt
+                numbers = scale, jax.lax.stop_gradient(compliance), movable, self.dt
                 return body_slope.inverses(space, rows.kinds, *numbers, bounds, corner, λ, u)
 
             solution = implicit_solution(

@@ -1,0 +1,124 @@
+"""The regularized law: u + C λ in place of u, with C as a share of the inverse mass of a row."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from tolerances import DIFFERENCE
+
+import jaxcon as jc
+from benchmarks import laws as study
+from benchmarks.bounded import SCENES, STEP
+from jaxcon.contact.limits import AT_ONCE, RECOVERED
+
+H = 2e-3
+NEARLY_RIGID = 1 / (4 * np.pi**2)
+SOLVERS = {
+    "Newton": lambda share: jc.solvers.Newton(tolerance=1e-11, regularization=share),
+    "InteriorPoint": lambda share: study.OneProblem(regularization=share),
+    "GaussSeidel": lambda share: jc.solvers.GaussSeidel(sweeps=400, regularization=share),
+}
+solvers = pytest.mark.parametrize("name", SOLVERS)
+
+
+@solvers
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_pushed_particle_sinks_and_creeps(name, dim, dtype):
+    """Its normal force m G and friction f give the velocities ρ h G and 0.04 ρ h f/m.
+
+    The former balances the speed at which the penetration closes: in one step if it is as small
+    as rounding, otherwise by a fifth in a step.
+    """
+    up, side = ((0.0, 1.0), (1.0, 0.0)) if dim == 2 else ((0.0, 0.0, 1.0), (0.6, 0.8, 0.0))
+    mass, push, share = 2.0, 4.0, 0.02
+    scene = jc.Scene(dim=dim, dtype=dtype, gravity=tuple(-9.81 * x for x in up))
+    scene.add_particle("puck", mass=mass)
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "puck", friction=0.5))
+    scene.add(jc.forces.Force("push", "puck", force=tuple(push * x for x in side)))
+    system, state = scene.build()
+    method = jc.Method(contact_solver=SOLVERS[name](share))
+    start = jc.init(system, method, state.q, state.v)
+    final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, H, 500))(start)
+    assert final.status == 0
+    close = 1e-3 if dtype == jnp.float32 else 1e-6
+    q, v = np.asarray(final.q), np.asarray(final.v)
+    speed = share * H * 9.81
+    closing = speed if speed < AT_ONCE[jnp.finfo(dtype).bits] else speed / RECOVERED
+    np.testing.assert_allclose(q @ up, -H * closing, rtol=close)
+    np.testing.assert_allclose(v @ side, 0.04 * share * H * push / mass, rtol=close)
+
+
+def stepped(name, scene, share, dtype=jnp.float64, worlds=50):
+    """A step from random states: the velocity after it, and the residual, per initial speed."""
+    build, draw = SCENES[scene]
+    system, state = build(dtype)
+    method = jc.Method(contact_solver=SOLVERS[name](share))
+    start = jc.init(system, method, state.q, state.v)
+
+    def one(key):
+        s = draw(key, system, start)
+        new, info = jc.step(system, method, s, None, STEP)
+        speed = jnp.max(jnp.abs(s.v))
+        return new.v / speed, info.reactions.residual / speed
+
+    return jax.jit(jax.vmap(one))(jax.random.split(jax.random.PRNGKey(3), worlds))
+
+
+@pytest.mark.parametrize("scene", ["box", "chain", "column"])
+def test_all_solvers_solve_the_same_laws(scene):
+    """Also sweeps, which do not hold the column by the exact laws."""
+    expected, missed = stepped("InteriorPoint", scene, NEARLY_RIGID)
+    assert np.max(missed) < 1e-10
+    for name in ("Newton", "GaussSeidel"):
+        found, missed = stepped(name, scene, NEARLY_RIGID)
+        settled = np.asarray(missed) < 1e-7
+        assert np.mean(settled) > (0.95 if name == "Newton" else 0.75)
+        np.testing.assert_allclose(found[settled], expected[settled], atol=1e-5)
+
+
+def test_the_motion_tends_to_that_of_the_exact_laws():
+    exact, _ = stepped("InteriorPoint", "chain", None)
+    shares = (1e-2, 1e-4, 1e-6)
+    off = [np.median(np.abs(stepped("Newton", "chain", x)[0] - exact).max(1)) for x in shares]
+    assert off[0] > 1e-4
+    np.testing.assert_allclose(np.divide(off[1:], off[:-1]), 1e-2, rtol=0.5)
+
+
+@pytest.mark.parametrize("name", ["Newton", "InteriorPoint"])
+@pytest.mark.parametrize("slides", [True, False])
+def test_gradients_are_differences(name, slides):
+    """By the speed of a puck that slides or creeps, by friction, and by the regularization itself.
+
+    The inverse mass of its rows is constant.
+    """
+    scene = jc.Scene(dim=3)
+    scene.add_particle("puck", mass=2.0, position=(0.0, 0.0, -1e-5))
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "puck", friction=0.4))
+    scene.add(jc.forces.Force("push", "puck", force=(3.0, 1.0, 0.0)))
+    system, state = scene.build()
+
+    def loss(x):
+        here = system.with_params({"floor": {"friction": x[1]}})
+        method = jc.Method(contact_solver=SOLVERS[name](x[2]))
+        start = jc.init(here, method, state.q, state.v)
+        start = dataclasses.replace(start, v=start.v.at[0].set(x[0]))
+        final, _ = jc.rollout(here, method, start, None, H, 30, record=lambda s, i: None)
+        return 10 * final.q[0] ** 2 + final.q[1] + 10 * final.q[2]
+
+    point = jnp.asarray([0.7 if slides else 0.0, 0.4, 0.02])
+    value, gradient = jax.jit(loss), jax.jit(jax.grad(loss))(point)
+    for i in range(3):
+        change = jnp.zeros(3).at[i].set(1e-6)
+        difference = (value(point + change) - value(point - change)) / 2e-6
+        np.testing.assert_allclose(gradient[i], difference, rtol=DIFFERENCE, atol=1e-10)
+    assert (abs(gradient[1]) > 1e-3) == slides
+    assert abs(gradient[2]) > 1e-5
+
+
+@pytest.mark.parametrize("part", ["Newton", "InteriorPoint", "GaussSeidel"])
+def test_a_negative_regularization_is_refused(part):
+    with pytest.raises(ValueError, match=rf"{part}.*regularization"):
+        getattr(jc.solvers, part)(regularization=-0.1)
