@@ -494,6 +494,13 @@ def by_table(x: Any) -> Any:
     return jax.lax.scan(lambda c, row: (c * row[None], None), known, 2 * x)[0]
 
 
+def largest(x: Any) -> Any:
+    """The largest entries, among equal ones and infinite ones, and of all."""
+    y = jnp.concatenate([x, x[:1], jnp.full((1, 2), -jnp.inf, x.dtype), x[2:] * jnp.nan])
+    some = jax.lax.top_k(y.T, 3)
+    return *some, *jax.lax.top_k(-x, 2), *jax.lax.top_k(y.T, 6)
+
+
 def of_nothing(x: Any) -> Any:
     none = x[:0]
     return (
@@ -563,6 +570,7 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     *[(at_index, (ARRAY, np.int32(k))) for k in PLACES],
     (by_table, (ARRAY,)),
     (iterated, (ARRAY,)),
+    (largest, (ARRAY,)),
     (of_nothing, (ARRAY,)),
     (whole, (4 * ARRAY,)),
     (logical, (ARRAY,)),

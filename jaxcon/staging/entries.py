@@ -695,6 +695,35 @@ class Evaluation:
             result[i] = index
         return result
 
+    def _largest(self, params: Mapping[str, Any], x: Entries) -> list[Entries]:
+        """Writes `top_k`: the largest entries and their indices; equal ones in their order.
+
+        NaN counts as larger than all numbers.
+        """
+        count, axis = params["k"], params.get("axis", x.ndim - 1)
+        rows = np.moveaxis(x, axis, -1)
+        if count * rows.size > MAX_LOADS:
+            raise UnsupportedError(f"the {count} largest of {rows.shape[-1]} entries")
+        values = np.empty((*rows.shape[:-1], count), object)
+        indices = np.empty(values.shape, object)
+        apply, select = self.thread.apply, self.thread.select
+        for place in np.ndindex(rows.shape[:-1]):
+            left: list[Any] = [np.True_] * rows.shape[-1]
+            for k in range(count):
+                best, index, found = rows[place][0], np.int32(0), left[0]
+                for i, (y, is_left) in enumerate(zip(rows[place][1:], left[1:], strict=True), 1):
+                    nan = apply("and", apply("ne", y, y), apply("eq", best, best))
+                    beats = apply("or", apply("gt", y, best), nan)
+                    beats = apply("and", is_left, apply("or", beats, apply("not", found)))
+                    best, index = select(beats, y, best), select(beats, np.int32(i), index)
+                    found = apply("or", found, is_left)
+                values[(*place, k)], indices[(*place, k)] = best, index
+                left = [
+                    apply("and", flag, apply("ne", index, np.int32(i)))
+                    for i, flag in enumerate(left)
+                ]
+        return [np.moveaxis(y, -1, axis) for y in (values, indices)]
+
     def _cumulative(self, params: Mapping[str, Any], x: Entries) -> Entries:
         """Writes a cumulative sum."""
         rows = np.moveaxis(x, params["axis"], 0)
@@ -891,6 +920,7 @@ OTHERS: dict[str, Other] = {
     "scatter_add": lambda run, params, x: [run._scatter(params, x, adds=True)],
     "somewhere": lambda run, params, x: [run._somewhere(*x)],
     "stack": lambda run, params, x: [np.stack(x, params["axis"])],
+    "top_k": lambda run, params, x: run._largest(params, *x),
     "unstack": lambda run, params, x: _rows(x[0], params["axis"]),
     "while": Evaluation._while,
 }
