@@ -628,7 +628,7 @@ class ContactSolver(TreeNode, Protocol):
 
     @property
     def regularization(self) -> Scalar | None:
-        """The least compliance of rows, as a share of the inverse mass that they meet."""
+        """The least compliance of rows, as a share of their inverse mass; None for exact laws."""
         return None
 
     def check(self) -> None:

@@ -661,6 +661,8 @@ def test_a_mistake_in_a_step_is_named(mistake):
 @pytest.mark.parametrize("mistake", STEPS)
 def test_it_is_named_when_tracing_too(mistake):
     act, words = STEPS[mistake]
+    for dtype in ((), ("float32",)):
+        scenes.build("mixed-2d", *dtype)  # once, outside of the trace
     with pytest.raises((ValueError, TypeError), match="(?s)" + ".*".join(words)):
         jax.jit(act)()
 

@@ -458,7 +458,7 @@ def test_the_rows_of_a_disc_have_one_inverse_mass():
     n, solver = len(rows), NEWTON.contact_solver
     bare, h = jnp.sum(jnp.asarray(rows) ** 2, axis=1), jnp.asarray(H)
     none = jnp.zeros(n)
-    _, mass, movable = newton.multipliers(space, bounds, none, none, None, bare, h, solver)
+    _, mass, movable, _ = newton.multipliers(space, bounds, none, none, None, bare, h, solver)
     assert not movable.all()
     for disc in bounds.kinds.split(mass).discs:
         np.testing.assert_array_equal(disc[0], disc[1])

@@ -51,6 +51,84 @@ def test_a_pushed_particle_sinks_and_creeps(name, dim, dtype):
     np.testing.assert_allclose(v @ side, 0.04 * share * H * push / mass, rtol=close)
 
 
+def leg(friction):
+    """A trunk of 50 kg on a rail, on a shank of 0.5 kg whose foot stands on a floor."""
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81))
+    scene.add_body("trunk", mass=50.0, inertia=1.0, position=(0.0, 0.75))
+    rail = {"point": (0.0, 0.75), "axis": (0.0, 1.0)}
+    scene.add(jc.Prismatic("rail", jc.WORLD, "trunk", **rail))
+    scene.add_body("shank", mass=0.5, inertia=0.01, position=(0.0, 0.25))
+    scene.add(jc.Revolute("knee", "trunk", "shank", point=(0.0, 0.5)))
+    foot = {"center": (0.0, 0.0), "friction": friction}
+    scene.add(jc.PlaneContact("foot", jc.WORLD, "shank", **foot))
+    return scene.build()
+
+
+@solvers
+@pytest.mark.parametrize("friction", [0.0, 0.8])
+def test_a_leg_carries_a_trunk(name, friction):
+    """Normal rows have their own inverse mass, not the larger one of the foot sideways."""
+    system, state = leg(friction)
+    method = jc.Method(contact_solver=SOLVERS[name](NEARLY_RIGID))
+    start = jc.init(system, method, state.q, state.v)
+    final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, H, 500))(start)
+    assert final.status == 0
+    # a penetration closes by a fifth in a step
+    expected = NEARLY_RIGID * H * 9.81 * H / RECOVERED
+    sunk = 0.75 - jc.position(system, final, "trunk")[1]
+    np.testing.assert_allclose(sunk, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("solver", "bounce"),
+    [
+        (jc.solvers.Newton, 1.0),
+        (jc.solvers.GaussSeidel, 1.0),
+        (jc.solvers.InteriorPoint, 1.0),
+        (jc.solvers.InteriorPoint, 0.0),
+    ],
+)
+def test_impacts_obey_the_exact_laws(solver, bounce):
+    """A particle rebounds as fast as it comes, and one that lands stops if landings are impacts."""
+    scene = jc.Scene(dim=3, gravity=(0.0, 0.0, 0.0))
+    scene.add_particle("puck", mass=2.0, position=(0.0, 0.0, 0.0315), velocity=(0.0, 0.0, -10.0))
+    elastic = {"restitution": bounce} if bounce else {}
+    scene.add(jc.PlaneContact("floor", jc.WORLD, "puck", **elastic))
+    system, state = scene.build()
+    method = jc.Method(contact_solver=solver(regularization=NEARLY_RIGID))
+    start = jc.init(system, method, state.q, state.v)
+    final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, H, 10))(start)
+    np.testing.assert_allclose(final.v[2], 10 * bounce, atol=1e-9)
+
+
+@solvers
+def test_a_world_with_a_bad_regularization_stops_alone(name):
+    system, state = leg(0.8)
+
+    def run(share):
+        solver = dataclasses.replace(SOLVERS[name](0.0), regularization=share)
+        method = jc.Method(contact_solver=solver)
+        start = jc.init(system, method, state.q, state.v)
+        return jc.rollout(system, method, start, None, H, 5)[0]
+
+    shares = jnp.asarray([0.02, jnp.nan, jnp.inf, -0.1, 0.0])
+    status = jax.jit(jax.vmap(run))(shares).status
+    np.testing.assert_array_equal(status, [0, *[jc.Status.NON_FINITE] * 3, 0])
+
+
+def test_friction_in_a_joint_creeps_as_friction_of_contacts_does():
+    scene = jc.Scene(dim=2, gravity=(0.0, -9.81))
+    scene.add_body("arm", mass=1.0, inertia=0.05, position=(0.5, 0.0))
+    scene.add(jc.Revolute("hinge", jc.WORLD, "arm", point=(0.0, 0.0)))
+    scene.add(jc.contacts.JointFriction("rub", "hinge", max_force=10.0))
+    system, state = scene.build()
+    method = jc.Method(contact_solver=SOLVERS["Newton"](0.02))
+    start = jc.init(system, method, state.q, state.v)
+    final, _ = jax.jit(lambda s: jc.rollout(system, method, s, None, H, 100))(start)
+    creep = 0.04 * 0.02 * H * (9.81 * 0.5) / 0.3
+    np.testing.assert_allclose(-final.v[2], creep, rtol=1e-3)
+
+
 def stepped(name, scene, share, dtype=jnp.float64, worlds=50):
     """A step from random states: the velocity after it, and the residual, per initial speed."""
     build, draw = SCENES[scene]

@@ -247,21 +247,24 @@ class Bounded:
 
 
 SLIP = 0.04
-"""The share of `ContactSolver.regularization` that disc rows have. With 1/(4 π²) for all rows, as
-for springs that swing once in two steps, contacts that stick would creep by a half mm/s at 2 ms."""
+"""The factor of `ContactSolver.regularization` for rows that hold by friction or by a motor.
+
+Without it, contacts that stick would creep by half a mm/s at 2 ms under their own weight.
+"""
 
 
 def regularized(compliance: Array, kinds: RowCounts, scale: Array, share: Scalar | None) -> Array:
-    """Returns the compliance C of each row, (n,), of at least a share of g.
+    """Raises the compliance C of each row to at least ρ g, or `SLIP` ρ g; returns it, (n,).
 
-    The law of a row is then that of u + C λ in place of u. A normal row presses where u < 0, and
-    friction is viscous below its bound. The forces of redundant contacts become unique.
+    The laws then hold for u + C λ in place of u. A normal row presses where u < 0, and friction
+    below its bound is viscous. The forces of redundant contacts become unique.
 
     Args:
         compliance: C of the rows themselves, (n,).
         kinds: numbers of rows by law.
-        scale: g, (n,), the change of a row's velocity by a unit of its own multiplier.
-        share: the share ρ, of which disc rows have `SLIP`; None for no regularization.
+        scale: g, (n,), the change of each row's velocity by a unit of its own multiplier. The rows
+            of a disc share their largest g, so that friction opposes slip.
+        share: ρ; None for no regularization.
 
     References:
         Castro, Permenter, Han, An Unconstrained Convex Formulation of Compliant Contact, IEEE
@@ -269,10 +272,13 @@ def regularized(compliance: Array, kinds: RowCounts, scale: Array, share: Scalar
     """
     if share is None:
         return compliance
-    least = jnp.asarray(share, scale.dtype)[None] * scale
-    parts = kinds.split(least)
-    discs = tuple(disc.map(lambda x: SLIP * x) for disc in parts.discs)
-    return jnp.maximum(compliance, kinds.join(parts._replace(discs=discs)))
+    least = kinds.split(jnp.asarray(share, scale.dtype)[None] * scale)
+    discs = []
+    for disc in least.discs:
+        largest = functools.reduce(jnp.maximum, disc) if len(disc) else least.normal
+        discs.append(disc.map(lambda _, x=largest: SLIP * x))
+    whole = kinds.join(least._replace(box=SLIP * least.box, discs=tuple(discs)))
+    return jnp.where(whole >= compliance, whole, compliance)
 
 
 Limits = tuple[Array, Array, tuple[Array, ...]]

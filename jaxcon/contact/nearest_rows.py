@@ -54,6 +54,11 @@ class ActiveSet(checks.Checked, ContactSolver):
         """The width of the smoothed corners of the laws, for the derivative only [m/s, rad/s]."""
         return self.solver.smoothing
 
+    @property
+    def regularization(self) -> Any:
+        """The least compliance of rows, as a share of their inverse mass; None for exact laws."""
+        return self.solver.regularization
+
     def check(self) -> None:
         """Checks the numbers of contacts and stops, and the solver.
 
@@ -145,4 +150,5 @@ def _least(x: Array, count: int | None) -> Array:
     if count is None or count >= len(x):
         indices = jnp.arange(len(x), dtype=jnp.int32)
         return jnp.broadcast_to(indices.reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
+    x = jnp.where(x == 0, 0, x)  # kernels do not order zeros by their signs
     return jnp.moveaxis(jax.lax.top_k(-jnp.moveaxis(x, 0, -1), count)[1], -1, 0)

@@ -44,7 +44,7 @@ from jaxcon.core import checks, numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.somewhere import somewhere
-from jaxcon.core.typing import Array, DType
+from jaxcon.core.typing import Array, DType, Scalar
 from jaxcon.linear.articulated import Articulated, ByBranch
 from jaxcon.protocols import ContactSolver
 
@@ -108,11 +108,13 @@ class Newton(checks.Checked, ContactSolver):
             fastest row.
         warm: True to start from the multipliers of the last step.
         smoothing: width of the smoothed corners of the laws, for the derivative only [m/s, rad/s].
-        regularization: the least compliance of a row, as a share of the inverse mass that it meets,
-            in a step of any length. 1/(4 π²) is nearly rigid. Of friction rows it is 0.04 times as
-            much. Forces are then unique, and continuous in the state; contacts sink in until they
-            recover as fast, and creep. The derivative treats the inverse mass as constant. None for
-            exact laws.
+        regularization: ρ, for a compliance of each row of at least ρ times its inverse mass, or
+            0.04 ρ for friction, rolling and spinning resistance, friction in joints, and motors.
+            1/(4 π²) is nearly rigid for steps of any length. Forces are then unique, and continuous
+            in the state. The price is that contacts under load lie a little in each other, and that
+            contacts that stick creep. Impacts with restitution are not affected. The derivative
+            treats inverse masses as constant, and those of rows between two bodies are without the
+            joints between them. None for exact laws.
 
     References:
         Castro, Permenter, Han, An Unconstrained Convex Formulation of Compliant Contact, IEEE
@@ -393,11 +395,13 @@ class Found(NamedTuple):
         mass: inverse mass g of each row, (n,). Rows of a contact have their largest; 1 if none of
             them can move.
         movable: mask of the rows that act and can move, (n,).
+        own: inverse mass of each row by itself, (n,); 0 if it does not act or cannot move.
     """
 
     multipliers: Array
     mass: Array
     movable: Array
+    own: Array
 
 
 def multipliers(
@@ -409,6 +413,7 @@ def multipliers(
     bare: Array,
     dt: Array,
     solver: Newton,
+    share: Scalar | None = None,
 ) -> Found:
     """Solves the inequality rows of a step.
 
@@ -421,6 +426,7 @@ def multipliers(
         bare: diagonal of J M⁻¹ Jᵀ, (n,).
         dt: step size h, () [s].
         solver: the solver.
+        share: the regularization ρ; None for exact laws.
     """
     kinds, order, h = rows.kinds, space.order, dt[None]
     friction, resistance, compliance = rows.friction, rows.resistance, rows.compliance
@@ -451,10 +457,11 @@ def multipliers(
         movable = movable & (moves | ~space.between(offset))
     movable = movable if acts is None else movable & acts
     movable = kinds.under_normals(kinds.split(movable))
-    largest = kinds.largest(jnp.where(movable, mass, 0))
+    own = jnp.where(movable, mass, 0)
+    largest = kinds.largest(own)
     mass = jnp.where(largest > 0, largest, 1)
     soft = numerics.safe_divide(compliance, h)
-    soft = regularized(soft, kinds, mass, jax.lax.stop_gradient(solver.regularization))
+    soft = regularized(soft, kinds, own, share)
     laws = Laws(
         kinds,
         SHARE * mass,
@@ -484,11 +491,8 @@ def multipliers(
     # with a small R, impulses are large until the step is whole
     unsettled = last.going & (last.ease[0] < LEAST)
     impulses = jnp.where(unsettled[None], last.center, last.impulses)
-    found = Found(numerics.safe_divide(impulses, h), mass, movable)
-    if sorts:
-        back = np.argsort(order)
-        found = Found(found.multipliers[back], found.mass[back], found.movable[back])
-    return found
+    found = Found(numerics.safe_divide(impulses, h), mass, movable, own)
+    return Found(*(x[np.argsort(order)] for x in found)) if sorts else found
 
 
 def _less(x: ByBranch, y: ByBranch) -> ByBranch:

@@ -30,7 +30,7 @@ from jaxcon.contact.rows import BoundRows, Reactions
 from jaxcon.core import numerics
 from jaxcon.core.jaxprs import each
 from jaxcon.core.status import Status
-from jaxcon.core.typing import Array
+from jaxcon.core.typing import Array, Scalar
 from jaxcon.linear import gauss_jordan
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.proximal import own_diagonal
@@ -67,6 +67,7 @@ class ContactProblem:
             if not computed.
         share: factor s of J̇_b v: ½ if the velocities at the end of a step belong to its middle,
             else 1.
+        regularization: ρ of `regularized`; None for exact laws.
         equations: the equations of motion of the trees of bodies if Newton's method solves the
             problem; None otherwise.
     """
@@ -81,6 +82,7 @@ class ContactProblem:
     acts: Any = None
     answers: Array | None = None
     share: float = 1.0
+    regularization: Any = None
     equations: TreeEquations | None = None
 
     @classmethod
@@ -93,6 +95,7 @@ class ContactProblem:
         acts: Array | None = None,
         sifts: bool = False,
         share: float = 1.0,
+        regularization: Scalar | None = None,
         equations: TreeEquations | None = None,
     ) -> ContactProblem:
         """Returns the contact problem of a step, from the factors of its saddle system.
@@ -105,13 +108,15 @@ class ContactProblem:
             acts: mask of the active rows, (n,); None for all.
             sifts: True to make immovable rows inactive, which `nearest` needs.
             share: factor s of J̇_b v in u.
+            regularization: ρ of `regularized`; None for exact laws.
             equations: the equations of motion of the trees of bodies if Newton's method solves the
                 problem; None otherwise.
         """
         bare = own_diagonal(saddle.mass, rows.jacobian, rows.rate.ndim - 1)
         start = 0 * saddle.force
         target = saddle.target
-        problem = cls(rows, solve, saddle, target, dt, start, bare, acts, None, share, equations)
+        options = None, share, regularization, equations
+        problem = cls(rows, solve, saddle, target, dt, start, bare, acts, *options)
         if equations is not None:
             first = problem.alone(saddle.force, saddle.target).acceleration
             return dataclasses.replace(problem, start=jax.lax.stop_gradient(first))._facing()
@@ -184,10 +189,15 @@ class ContactProblem:
     def judge(self) -> Array:
         """Returns the status NON_FINITE if a number of the rows is not finite, else OK, ().
 
+        A regularization must not be negative either.
+
         Laws and solvers compare numbers. Comparisons with NaN are false and would silently ignore
         the row.
         """
         finite = self.rows.finite(self.bare)
+        if self.regularization is not None:
+            share = jnp.asarray(self.regularization, self.bare.dtype)
+            finite &= jnp.isfinite(share) & (share >= 0)
         return jnp.where(finite, Status.OK, Status.NON_FINITE).astype(jnp.int32)
 
     def motion(self, multipliers: Array) -> Solution:
@@ -266,8 +276,8 @@ class ContactProblem:
         movable = self.movable(matrix)
         free = self.end_velocity(self.start)
         soft = jnp.where(movable[None] & movable[:, None], matrix, 0)
-        scale = rows.kinds.largest(gauss_jordan.diagonal(soft))
-        compliance = regularized(rows.compliance, rows.kinds, scale, solver.regularization)
+        scale = gauss_jordan.diagonal(soft)
+        compliance = regularized(rows.compliance, rows.kinds, scale, self.regularization)
         soft = jax.lax.stop_gradient(soft + compliance[None] * gauss_jordan.identity(rows.rate))
 
         def met(wanted: Array) -> tuple[Array, Array]:
@@ -300,11 +310,13 @@ class ContactProblem:
 
         def met(wanted: Array) -> tuple[Array, Array]:
             offset = jax.lax.stop_gradient(free - wanted)
-            λ, mass, movable = newton.multipliers(
-                space, fixed, offset, start, self.acts, self.bare, self.dt, solver
+            share = jax.lax.stop_gradient(self.regularization)
+            λ, mass, movable, own = newton.multipliers(
+                space, fixed, offset, start, self.acts, self.bare, self.dt, solver, share
             )
-            scale = jnp.where(self.dt > 0, self.dt, 1)[None] * mass
-            compliance = regularized(rows.compliance, rows.kinds, scale, solver.regularization)
+            h = jnp.where(self.dt > 0, self.dt, 1)[None]
+            scale, kinds = h * mass, rows.kinds
+            compliance = regularized(rows.compliance, kinds, h * own, self.regularization)
 
             def moved(multipliers: Array) -> Array:
                 here = self.velocity(multipliers) + compliance * multipliers - wanted

@@ -30,7 +30,7 @@ from jaxcon.core import notices, numerics, status
 from jaxcon.core.doubled import Doubled, rounded
 from jaxcon.core.lanes import add_rhs_axis
 from jaxcon.core.pytree import pytree
-from jaxcon.core.typing import Array, PyTree
+from jaxcon.core.typing import Array, PyTree, Scalar
 from jaxcon.linear.jacobian import Jacobian
 from jaxcon.linear.saddle import Diagonal, Factored, Saddle, Solution
 from jaxcon.protocols import ContactSolver
@@ -118,7 +118,8 @@ class Response:
             bounds = dataclasses.replace(bounds, rate_change=change)
         base = dataclasses.replace(bounds, restitution=None) if strikes else bounds
         hard = keeps_rows(system, rows)
-        impulse = self._impulse(dynamics, (q, v), base, system, length, bounds.acts, hard, share)
+        given = length, bounds.acts, hard, share, self.solver.regularization
+        impulse = self._impulse(dynamics, (q, v), base, system, *given)
         both_stops, e, bounds = bounds, bounds.restitution, impulse.rows
         seen, may = None, jnp.zeros_like(bounds.rate, bool)
         if lands:
@@ -235,7 +236,10 @@ class Response:
         system = dataclasses.replace(system, force=force, target=target)
         time = jnp.where(lasts, dt, jnp.ones_like(dt))
         hard = keeps_rows(system, linearized)
-        impulse = self._impulse(dynamics, point[:2], rows, system, time, acts, hard)
+        ρ = self.solver.regularization
+        ρ = None if ρ is None else jnp.where(lasts, ρ, 0)  # impacts obey the exact laws
+        problem = rows, system, time, acts, hard
+        impulse = self._impulse(dynamics, point[:2], *problem, regularization=ρ)
         reactions = impulse.react(self.solver, None)
         solution = dynamics.system.complete(impulse.motion(reactions.multipliers))
         return solution, self._judged(impulse, reactions, solution.acceleration)
@@ -250,6 +254,7 @@ class Response:
         acts: Array | None,
         hard: bool,
         share: float = 1.0,
+        regularization: Scalar | None = None,
     ) -> ContactProblem:
         """Returns the contact problem, with factors of the equality rows.
 
@@ -270,7 +275,7 @@ class Response:
             solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
             solve = solver.factor(add_rhs_axis(system, system.force.ndim - 1))
         return ContactProblem.of(
-            rows, solve, system, dt, acts, self._leaves_out(rows), share, equations
+            rows, solve, system, dt, acts, self._leaves_out(rows), share, regularization, equations
         )
 
     def _judged(

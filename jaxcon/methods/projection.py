@@ -310,7 +310,10 @@ class Projection(checks.Checked, Stabilizer):
                 most = largest(left)
                 solution = solve(left)
                 d = jnp.where(goes(most, before)[None], d - factor * solution.acceleration, d)
-                code = status.first(code, status.failures(solution.status))
+                # `left` decides if the iterations have converged
+                missed = solution.status == Status.NOT_CONVERGED
+                found = jnp.where(missed, Status.OK, status.failures(solution.status))
+                code = status.first(code, found.astype(code.dtype))
                 return count + 1, d, residual(d), most, code
 
             none = jnp.zeros_like(state.status)
@@ -340,8 +343,7 @@ class Projection(checks.Checked, Stabilizer):
             code = jnp.where(met, Status.OK, code)
         else:
             d, (left, code) = roots.implicit(equation, still, iterate, self.iterations)
-            # `left` decides if the iterations have converged
-            code = jnp.where(code == Status.NOT_CONVERGED, Status.OK, code).astype(jnp.int32)
+            code = code.astype(jnp.int32)
         late = jnp.where(largest(left) > fails, Status.NOT_CONVERGED, Status.OK)
         code = status.first(status.failures(code), late.astype(jnp.int32))
         if not coupled:

@@ -64,7 +64,7 @@ class OneWorld:
     """
 
     def __init__(self, closed: ClosedJaxpr, chunk_size: int) -> None:
-        # the loops of a rollout compute what no one reads, such as infos that are not recorded
+        # a rollout that records no infos must not compute them
         self.closed = ClosedJaxpr(without_unused(closed.jaxpr), closed.consts)
         self.chunk_size = chunk_size
         self.results = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in closed.out_avals]

@@ -54,7 +54,7 @@ MAX_UNROLLED = 30_000
 """The largest number of instructions of such a loop, if it can be written as a loop."""
 
 MAX_UNROLLED_HELD = 100_000
-"""The same, if rows that the rounds write are read later: a loop holds them all in registers."""
+"""`MAX_UNROLLED` of a loop whose written rows are read later, and are held in registers."""
 
 MAX_ITERATED = 1000
 """The largest number of instructions of an unrolled loop whose rounds are all alike.
@@ -698,7 +698,7 @@ class Evaluation:
     def _largest(self, params: Mapping[str, Any], x: Entries) -> list[Entries]:
         """Writes `top_k`: the largest entries and their indices; equal ones in their order.
 
-        NaN counts as larger than all numbers.
+        NaN of either sign counts as larger than all numbers, and zeros of both signs as equal.
         """
         count, axis = params["k"], params.get("axis", x.ndim - 1)
         rows = np.moveaxis(x, axis, -1)

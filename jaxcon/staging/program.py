@@ -328,16 +328,18 @@ class Program:
         return self._emit(equation, params, args, True)
 
     def _append_arithmetic(self, equation: JaxprEqn, args: list[Operand]) -> list[Any] | None:
-        """Appends most operations of a step, those on two operands that are not constant.
+        """Appends an arithmetic operation on two arrays of numbers that are not constant.
 
-        It does for them what `_append` does for all equations. It returns None for others, and for
-        results without entries.
+        Most operations of a step are such. They have no effects, a kernel may contain them, and
+        none of their results is known. Returns None for other operands, and for results without
+        entries or of symbolic size.
         """
         first, second = args
         aval: Any = equation.outvars[0].aval
         if isinstance(first, Constant) or isinstance(second, Constant):
             return None
-        if not all(type(n) is int and n for n in aval.shape):
+        given: Any = equation.invars[0].aval
+        if not all(type(n) is int and n for n in aval.shape) or _is_key(given):
             return None
         primitive, params = equation.primitive, equation.params
         swaps = second < first and primitive.name in COMMUTATIVE
