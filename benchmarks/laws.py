@@ -8,6 +8,7 @@ solver is not used.
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -170,10 +171,17 @@ def measure(name: str, dtype: DTypeLike, solver: Any, worlds: int) -> Laws:
         violations = judged(rows, info.reactions.multipliers, (free.v, new.v), size)
         return jax.tree.map(lambda x: jnp.where(failed(new.status), jnp.inf, x), violations)
 
-    run = jax.jit(jax.vmap(laws_of_step))
-    keys = jax.random.split(jax.random.PRNGKey(0), worlds)
+    return Laws(*in_blocks(laws_of_step, worlds))
+
+
+def in_blocks(
+    function: Callable[[jax.Array], tuple[Any, ...]], worlds: int, seed: int = 0
+) -> list[np.ndarray]:
+    """Returns the results of a function of random keys, (worlds, …) each, in blocks of worlds."""
+    run = jax.jit(jax.vmap(function))
+    keys = jax.random.split(jax.random.PRNGKey(seed), worlds)
     blocks = [run(keys[i : i + BLOCK]) for i in range(0, worlds, BLOCK)]
-    return Laws(*(np.concatenate(x) for x in zip(*blocks, strict=True)))
+    return [np.concatenate(x) for x in zip(*blocks, strict=True)]
 
 
 def beyond(violations: Laws, dtype: DTypeLike) -> Laws:
@@ -191,7 +199,9 @@ REGULARIZED = {
 """The solvers of `regularized_table`."""
 
 
-def step_of(name: str, dtype: DTypeLike, solver: Any, worlds: int) -> tuple[Any, Any]:
+def step_of(
+    name: str, dtype: DTypeLike, solver: Any, worlds: int, seed: int = 0
+) -> tuple[Any, Any]:
     """Returns v after a step from random states, (worlds, n_v), and the residual, (worlds,).
 
     Both are divided by the largest initial velocity.
@@ -207,10 +217,7 @@ def step_of(name: str, dtype: DTypeLike, solver: Any, worlds: int) -> tuple[Any,
         speed = jnp.max(jnp.abs(start.v))
         return new.v / speed, info.reactions.residual / speed
 
-    run = jax.jit(jax.vmap(one))
-    keys = jax.random.split(jax.random.PRNGKey(0), worlds)
-    blocks = [run(keys[i : i + BLOCK]) for i in range(0, worlds, BLOCK)]
-    v, residual = (np.concatenate(x) for x in zip(*blocks, strict=True))
+    v, residual = in_blocks(one, worlds, seed)
     return v, residual
 
 

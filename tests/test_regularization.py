@@ -10,7 +10,6 @@ from tolerances import DIFFERENCE
 
 import jaxcon as jc
 from benchmarks import laws as study
-from benchmarks.bounded import SCENES, STEP
 from jaxcon.contact.limits import AT_ONCE, RECOVERED
 
 H = 2e-3
@@ -129,20 +128,8 @@ def test_friction_in_a_joint_creeps_as_friction_of_contacts_does():
     np.testing.assert_allclose(-final.v[2], creep, rtol=1e-3)
 
 
-def stepped(name, scene, share, dtype=jnp.float64, worlds=50):
-    """A step from random states: the velocity after it, and the residual, per initial speed."""
-    build, draw = SCENES[scene]
-    system, state = build(dtype)
-    method = jc.Method(contact_solver=SOLVERS[name](share))
-    start = jc.init(system, method, state.q, state.v)
-
-    def one(key):
-        s = draw(key, system, start)
-        new, info = jc.step(system, method, s, None, STEP)
-        speed = jnp.max(jnp.abs(s.v))
-        return new.v / speed, info.reactions.residual / speed
-
-    return jax.jit(jax.vmap(one))(jax.random.split(jax.random.PRNGKey(3), worlds))
+def stepped(name, scene, share):
+    return study.step_of(scene, jnp.float64, SOLVERS[name](share), worlds=50, seed=3)
 
 
 @pytest.mark.parametrize("scene", ["box", "chain", "column"])
@@ -168,9 +155,9 @@ def test_the_motion_tends_to_that_of_the_exact_laws():
 @pytest.mark.parametrize("name", ["Newton", "InteriorPoint"])
 @pytest.mark.parametrize("slides", [True, False])
 def test_gradients_are_differences(name, slides):
-    """By the speed of a puck that slides or creeps, by friction, and by the regularization itself.
+    """A rollout of a puck is differentiated by its speed, its friction and the regularization.
 
-    The inverse mass of its rows is constant.
+    The puck slides or creeps. The inverse mass of its rows is constant.
     """
     scene = jc.Scene(dim=3)
     scene.add_particle("puck", mass=2.0, position=(0.0, 0.0, -1e-5))

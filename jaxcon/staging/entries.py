@@ -421,7 +421,7 @@ class Evaluation:
             for x, place in zip(body.closed.jaxpr.outvars[carries:], places, strict=True)
             if not place
         ]
-        fits = self._fit(rows) and (not held or length * sum(held) <= MAX_HELD)
+        fits = self._fit(rows) and length * sum(held) <= MAX_HELD
         repeats = length > 1 and fits and not params["reverse"]
         if length > MAX_ROUNDS and repeats and not held:
             return self._repeat(body, fixed, carried, rows, places, length)
