@@ -484,6 +484,10 @@ def at_index(x: Any, k: Any) -> Any:
         x[0, 0].at[...].add(5.0) + x,
         x.at[some + k].add(x[:2]),
         x.at[jnp.array([0, 9])].set(5.0),
+        x.at[k].max(x[0]),
+        x.at[some + k].min(x[:2]),
+        x.at[jnp.array([0, 0])].mul(x[:2]),
+        jax.ops.segment_max(x, jnp.array([2, 0, 2]), 3),
     )
 
 

@@ -655,8 +655,17 @@ class Evaluation:
         order = [*(a for a in range(rank) if a not in offsets), *offsets]
         return [np.transpose(slices, np.argsort(order))]
 
-    def _scatter(self, params: Mapping[str, Any], operands: list[Entries], adds: bool) -> Entries:
-        """Writes `lax.scatter` or `lax.scatter_add`: changes one slice for each row of indices."""
+    def _scatter(
+        self, params: Mapping[str, Any], operands: list[Entries], operation: str | None
+    ) -> Entries:
+        """Writes `lax.scatter` or one like `lax.scatter_add`, slice by slice.
+
+        Args:
+            params: the parameters of the scatter.
+            operands: the array, the indices of its slices, and their updates.
+            operation: the operation that combines old and new numbers, such as "add"; None to
+                replace the old ones.
+        """
         x, indices, updates = operands[0].copy(), *operands[1:]
         numbers = params["dimension_numbers"]
         if numbers.operand_batching_dims:
@@ -669,9 +678,9 @@ class Evaluation:
             new = np.expand_dims(moved[(*place, ...)], tuple(numbers.inserted_window_dims))
             starts = _starts(numbers.scatter_dims_to_operand_dims, indices[place], x.ndim)
             change = (
-                (lambda old, new=new: self._each("add", {}, [old, new]))
-                if adds
-                else (lambda _, new=new: new)
+                (lambda _, new=new: new)
+                if operation is None
+                else (lambda old, new=new: self._each(operation, {}, [old, new]))
             )
             self._update(x, starts, new.shape, clamps, change)
         return x
@@ -915,9 +924,7 @@ OTHERS: dict[str, Other] = {
     "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
     "pad": lambda run, params, x: [_pad(params, *x)],
     "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],
-    "scatter": lambda run, params, x: [run._scatter(params, x, adds=False)],
-    "scatter-add": lambda run, params, x: [run._scatter(params, x, adds=True)],
-    "scatter_add": lambda run, params, x: [run._scatter(params, x, adds=True)],
+    "scatter": lambda run, params, x: [run._scatter(params, x, None)],
     "somewhere": lambda run, params, x: [run._somewhere(*x)],
     "stack": lambda run, params, x: [np.stack(x, params["axis"])],
     "top_k": lambda run, params, x: run._largest(params, *x),
@@ -926,6 +933,13 @@ OTHERS: dict[str, Other] = {
 }
 """Operations that are neither elementwise nor in `MOVES`."""
 OTHERS |= {name: lambda run, params, x: x for name in PLACINGS}
+OTHERS |= {
+    f"scatter{hyphen}{name}": (
+        lambda run, params, x, name=name: [run._scatter(params, x, name)]  # type: ignore[misc]
+    )
+    for name in ("add", "mul", "min", "max")
+    for hyphen in "-_"  # older and newer versions of JAX
+}
 OTHERS |= {
     name: lambda run, params, x, name=name: [run._reduce(name, params, *x)]  # type: ignore[misc]
     for name in PAIRS
