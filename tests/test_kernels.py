@@ -6,6 +6,7 @@ Those for NVIDIA's GPUs are run on the CPU by `ptx_machine`.
 import dataclasses
 import functools
 import inspect
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -227,7 +228,8 @@ UNSUPPORTED = {
     "many places": lambda x: jnp.arange(5000.0)[x[0, 0].astype(int)] + x,
     "remainder": lambda x: x % 3,
     "unsigned": lambda x: -x.astype(jnp.uint32),
-    "sort": jnp.sort,
+    "long sort": lambda x: x + jnp.sort(jnp.tile(x[0], 20))[0],
+    "large matrix": lambda x: x + jnp.linalg.cholesky(jnp.eye(60) + x[0, 0])[0, 0],
     "keys": lambda x: x + jax.random.uniform(jax.random.key(0), x.shape),
     "long": lambda x: jax.lax.fori_loop(
         0, 10**5, lambda i, y: jax.lax.fori_loop(0, 10**5, lambda j, z: z * 0.5 + 1, y), x
@@ -505,6 +507,12 @@ def largest(x: Any) -> Any:
     return *some, *jax.lax.top_k(-x, 2), *jax.lax.top_k(y.T, 6)
 
 
+def ranked(x):
+    """Sorts with equal keys, infinite ones and NaN, and along either axis."""
+    y = jnp.concatenate([x, x[:1], jnp.full((1, 2), jnp.inf, x.dtype), x[2:] * jnp.nan, -x])
+    return jnp.sort(y, 0), jnp.argsort(y, 0), jnp.sort(x, 1), jnp.argsort(jnp.round(x[:, 0]))
+
+
 def of_nothing(x: Any) -> Any:
     none = x[:0]
     return (
@@ -575,6 +583,7 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
     (by_table, (ARRAY,)),
     (iterated, (ARRAY,)),
     (largest, (ARRAY,)),
+    (ranked, (ARRAY,)),
     (of_nothing, (ARRAY,)),
     (whole, (4 * ARRAY,)),
     (logical, (ARRAY,)),
@@ -584,6 +593,38 @@ CASES: list[tuple[Callable[..., Any], Sequence[np.ndarray]]] = [
 @pytest.mark.parametrize(("function", "args"), CASES)
 def test_operations(platform, function, args):
     check_operations(platform, function, args)
+
+
+def decomposed(x):
+    """Decompositions and solves of regular, singular, indefinite and stacked matrices."""
+    definite = x @ x.T + jnp.eye(3, dtype=x.dtype)
+    y = jnp.concatenate([x, x[:, :1] * x[::-1, 1:] + 0.3], 1)
+    half = jnp.linalg.cholesky(definite, symmetrize_input=False)
+    factors = jax.scipy.linalg.lu_factor(y)
+    sides, flags = ((True, x), (False, x.T)), (False, True)
+    solve = jax.lax.linalg.triangular_solve
+    return (
+        half,
+        jnp.linalg.cholesky(-definite, symmetrize_input=False),
+        jnp.linalg.cholesky(jnp.stack([definite, 2 * definite])),
+        jax.scipy.linalg.cho_solve((half, True), x),
+        *factors,
+        *(jax.scipy.linalg.lu_solve(factors, x, trans=trans) for trans in (0, 1)),
+        *jax.lax.linalg.lu(jnp.stack([y, y[::-1], y.T, 0 * y])),
+        *(
+            solve(matrix, b, left_side=side, lower=lower, transpose_a=turned, unit_diagonal=unit)
+            for matrix, lower in ((half, True), (y, False))
+            for (side, b), turned, unit in itertools.product(sides, flags, flags)
+        ),
+    )
+
+
+@pytest.mark.parametrize("x", [ARRAY, ARRAY[::-1], -ARRAY])
+def test_decompositions_of_small_matrices(platform, x):
+    here = evaluated(platform, decomposed, x.astype(np.float64))
+    for a, b in zip(here, expected(decomposed, x.astype(np.float64)), strict=True):
+        assert a.dtype == b.dtype
+        np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12)
 
 
 def held(x):

@@ -20,6 +20,7 @@ from jax.extend.core import ClosedJaxpr, Var
 
 from jaxcon.core.host import ELEMENTWISE, STRUCTURAL
 from jaxcon.core.jaxprs import read_arguments
+from jaxcon.staging import matrices
 from jaxcon.staging.constants import MOVES
 from jaxcon.staging.elementary import FUNCTIONS, rounded
 from jaxcon.staging.program import Constant, Operand, Operation, Program
@@ -70,6 +71,9 @@ The row is chosen by its index among all rows.
 
 MAX_HELD = 4096
 """The largest number of entries that all rounds of a loop write to registers."""
+
+MAX_SORTED = 32
+"""The largest number of entries that are sorted."""
 
 MAX_LOADS = 4096
 """The largest number of entries of an array in memory that are read outside of loops."""
@@ -347,11 +351,11 @@ class Evaluation:
         branches: tuple[Body, ...] = params["branches"]
         which: Any = operands[0][()]
         given = operands[1:]
+        if isinstance(which, np.generic):
+            return self(branches[min(max(int(which), 0), len(branches) - 1)], given)
         if len(branches) != 2:
             raise UnsupportedError("a conditional of more than two branches")
-        taken = self.thread.convert(which, bool)
-        if isinstance(taken, np.generic):
-            return self(branches[int(taken)], given)
+        taken: Any = self.thread.convert(which, bool)
         shapes: list[tuple[int, ...]] = []
 
         def write(body: Body) -> Callable[[], list[Scalar]]:
@@ -733,6 +737,27 @@ class Evaluation:
                 ]
         return [np.moveaxis(y, -1, axis) for y in (values, indices)]
 
+    def _sort(self, params: Mapping[str, Any], operands: list[Entries]) -> list[Entries]:
+        """Writes `lax.sort` by one key: swaps neighbors, which keeps the order of equal keys.
+
+        NaN counts as larger than all numbers, and zeros of both signs as equal.
+        """
+        axis, apply, select = params["dimension"], self.thread.apply, self.thread.select
+        rows = [np.moveaxis(x, axis, -1).copy() for x in operands]
+        count = rows[0].shape[-1]
+        if params["num_keys"] != 1 or count > MAX_SORTED:
+            raise UnsupportedError(f"a sort of {count} entries by {params['num_keys']} keys")
+        for place in np.ndindex(rows[0].shape[:-1]):
+            lines = [x[place] for x in rows]
+            for i, j in [(i, i + 1) for end in range(count, 1, -1) for i in range(end - 1)]:
+                x, y = lines[0][i], lines[0][j]
+                nan = apply("and", apply("ne", x, x), apply("eq", y, y))
+                swaps = apply("or", apply("gt", x, y), nan)
+                for line in lines:
+                    x, y = line[i], line[j]
+                    line[i], line[j] = select(swaps, y, x), select(swaps, x, y)
+        return [np.moveaxis(x, -1, axis) for x in rows]
+
     def _cumulative(self, params: Mapping[str, Any], x: Entries) -> Entries:
         """Writes a cumulative sum."""
         rows = np.moveaxis(x, params["axis"], 0)
@@ -902,6 +927,18 @@ def _filling(params: Mapping[str, Any], dtype: np.dtype) -> np.generic | None:
     return dtype.type(np.nan if value is None else value)
 
 
+def _other_platform(params: Mapping[str, Any]) -> np.int32:
+    """Returns which of the cases of `lax.platform_dependent` is for unnamed platforms.
+
+    Raises:
+        UnsupportedError: another case may be for the platform of the kernel.
+    """
+    platforms = params["platforms"]
+    if any(name in ("cpu", "cuda", "gpu") for names in platforms for name in names or ()):
+        raise UnsupportedError("a case of this platform")
+    return np.int32(platforms.index(None))
+
+
 def _rows(x: Entries, axis: int) -> list[Entries]:
     """Returns the slices of an array at each index along an axis, without this axis."""
     return [np.take(x, [k], axis).squeeze(axis) for k in range(x.shape[axis])]
@@ -912,6 +949,7 @@ Other = Callable[[Evaluation, Mapping[str, Any], list[Entries]], Sequence[Entrie
 OTHERS: dict[str, Other] = {
     "argmax": lambda run, params, x: [run._extreme_index("argmax", params, *x)],
     "argmin": lambda run, params, x: [run._extreme_index("argmin", params, *x)],
+    "cholesky": lambda run, params, x: matrices.cholesky(run.thread, params, *x),
     "cond": Evaluation._cond,
     "cumsum": lambda run, params, x: [run._cumulative(params, *x)],
     "dot_general": lambda run, params, x: [run._dot(params, *x)],
@@ -922,12 +960,17 @@ OTHERS: dict[str, Other] = {
     "expand_dims": lambda run, params, x: [np.expand_dims(x[0], params["dimensions"])],
     "gather": Evaluation._gather,
     "iota": lambda run, params, x: [entries(STRUCTURAL["iota"](params))],
+    "lu": lambda run, params, x: matrices.lu(run.thread, params, *x),
+    "lu_pivots_to_permutation": lambda run, params, x: matrices.permutation(run.thread, params, *x),
     "pad": lambda run, params, x: [_pad(params, *x)],
+    "platform_index": lambda run, params, x: [entries(_other_platform(params))],
     "rev": lambda run, params, x: [np.flip(x[0], params["dimensions"])],
     "scatter": lambda run, params, x: [run._scatter(params, x, None)],
     "somewhere": lambda run, params, x: [run._somewhere(*x)],
+    "sort": Evaluation._sort,
     "stack": lambda run, params, x: [np.stack(x, params["axis"])],
     "top_k": lambda run, params, x: run._largest(params, *x),
+    "triangular_solve": lambda run, params, x: matrices.triangular_solve(run.thread, params, *x),
     "unstack": lambda run, params, x: _rows(x[0], params["axis"]),
     "while": Evaluation._while,
 }
