@@ -656,23 +656,32 @@ def check_operations(platform, function, args):
         np.testing.assert_allclose(x, y, rtol=1e-6)
 
 
-@pytest.mark.parametrize("worlds", [2, 7, 16, 37])
-@pytest.mark.parametrize("function", [swapped, branched, each_row, nested])
-def test_worlds_take_their_own_branches_and_rounds(platform, function, worlds):
+@pytest.mark.parametrize("worlds", [2, 7, 16, 37, 70])
+@pytest.mark.parametrize("function", [swapped, branched, each_row, nested, scanned])
+@pytest.mark.parametrize("long", [False, True])
+def test_worlds_take_their_own_branches_and_rounds(platform, function, worlds, long, monkeypatch):
+    """With long programs, four groups of lanes evaluate each piece of a kernel in turn."""
+    if long:
+        monkeypatch.setattr(cpu, "LONG", 0)
+        monkeypatch.setattr(entries, "MAX_UNROLLED", 0)
     random = np.random.default_rng(worlds)
     count = len(inspect.signature(function).parameters)
-    shape = (worlds, 3) if function is each_row else (worlds,)
-    args = [3 * random.standard_normal(shape).astype(np.float32) for _ in range(count)]
+    shape = {each_row: (3,), scanned: ARRAY.shape}.get(function, ())
+    args = [3 * random.standard_normal((worlds, *shape)) for _ in range(count)]
     one = jax.make_jaxpr(function)(*(x[0] for x in args))
     given = list(map(jnp.asarray, args))
     here = kernels.run_worlds(platform, one, given, [0] * count, worlds)
     for x, y in zip(here, expected(jax.vmap(function), *args), strict=True):
-        np.testing.assert_allclose(np.moveaxis(np.asarray(x), -1, 0), y, rtol=1e-6)
+        np.testing.assert_allclose(np.moveaxis(np.asarray(x), -1, 0), y, rtol=1e-11, atol=1e-11)
 
 
-@pytest.mark.parametrize("worlds", [1, 5, 16, 19])
-def test_worlds_that_two_groups_of_lanes_have_step_once(worlds):
+@pytest.mark.parametrize(
+    ("worlds", "long"), [(1, False), (5, False), (16, False), (19, False), (19, True), (37, True)]
+)
+def test_worlds_that_two_groups_of_lanes_have_step_once(worlds, long, monkeypatch):
     """A kernel on a CPU writes its results in place of its arguments."""
+    if long:
+        monkeypatch.setattr(cpu, "LONG", 0)
     with jax.enable_x64(True):
         system, states = batch("four-bar", np.float64, worlds)
 

@@ -26,10 +26,21 @@ from jax.interpreters import mlir
 
 from jaxcon.staging import llvm
 from jaxcon.staging.kernels import NAME, called, kernel_p
-from jaxcon.staging.thread import Instruction, Layout, Statement
+from jaxcon.staging.thread import Instruction, Layout, Statement, count_of
 
 OPTIMIZATION = 1
 """LLVM's level of optimization. At level 2, code is no faster and takes longer to compile."""
+
+
+LONG = 150_000
+"""The number of instructions from which on a program does not fit into the second cache.
+
+The half-cheetah's gradient of 121,000 instructions gains 16 % from groups of lanes, the walker's of
+112,000 loses 13 %; the ant's of 165,000 gains 30 %, and the humanoid's step of 221,000 gains 20 %.
+"""
+
+GROUPS = 4
+"""The number of groups of lanes that evaluate each piece of a long program in turn."""
 
 
 class Cpu:
@@ -44,7 +55,8 @@ class Cpu:
     ) -> str:
         """Returns the text of a kernel."""
         lanes = min(_register_bytes() // _size(program), 1 << (worlds.bit_length() - 1))
-        return llvm.text(program, NAME, worlds, arrays, results, lanes)
+        groups = min(GROUPS, worlds // lanes) if count_of(program) > LONG else 1
+        return llvm.text(program, NAME, worlds, arrays, results, lanes, groups)
 
 
 def _size(program: Sequence[Statement]) -> int:

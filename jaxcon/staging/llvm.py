@@ -8,6 +8,10 @@ The program is cut into pieces of some hundred instructions, each of which is a 
 that another piece reads lies in memory, at a place that later values reuse. LLVM would find such
 places itself in a single function, but in a time that grows faster than the program.
 
+A long program does not fit into the caches of instructions. There each piece is evaluated for
+several groups of lanes, one after the other, before the next piece: its instructions are read once
+for all of them. A branch is skipped if no lane of any group needs it, and a group by itself within.
+
 The function has the interface that XLA defines for functions of other libraries: its argument is a
 description of the call, with the addresses of arrays.
 
@@ -95,6 +99,7 @@ def text(
     arrays: Sequence[Layout],
     results: int,
     lanes: int,
+    groups: int = 1,
 ) -> str:
     """Returns the text of a function that evaluates a program in all worlds.
 
@@ -104,13 +109,19 @@ def text(
     Args:
         program: the program of a thread.
         name: the name of the function.
-        worlds: the number of worlds, at least as many as lanes.
+        worlds: the number of worlds, at least as many as lanes of all groups.
         arrays: the layouts of all arrays.
         results: the number of arrays that are results; they are the last ones.
         lanes: the number of worlds that are evaluated together.
+        groups: the number of groups of lanes for which each piece is evaluated.
     """
     parts = _in_pieces(program)
-    writer = _Writer(lanes, arrays, _Places(parts))
+    places = _Places(parts)
+    writer = (
+        _Writer(lanes, arrays, places)
+        if groups == 1
+        else _GroupsWriter(lanes, arrays, places, groups, _depth(parts))
+    )
     writer.start(len(arrays) - results)
     writer.worlds(parts, worlds)
     lines = [f"{SCRATCH}{writer.scratch}"]
@@ -136,6 +147,20 @@ def _in_pieces(statements: Sequence[Statement]) -> list[Statement]:
         else:
             parts += [inner(x, _in_pieces) for x in group]
     return parts
+
+
+def _depth(parts: Sequence[Statement]) -> int:
+    """Returns how deeply branches and loops are nested."""
+    deepest = 0
+    for part in parts:
+        match part:
+            case Branch(_, taken, others):
+                deepest = max(deepest, 1 + _depth(taken), 1 + _depth(others))
+            case Loop(condition, _, body):
+                deepest = max(deepest, 1 + _depth(condition), 1 + _depth(body))
+            case Repeat(_, _, body):
+                deepest = max(deepest, _depth(body))
+    return deepest
 
 
 class _Places:
@@ -251,8 +276,8 @@ class _Writer:
         self._types = {dtype: self._vector(kind) for dtype, kind in TYPES.items()}
         sizes = {kind: n * self._bytes(kind) for kind, n in places.count.items()}
         starts = itertools.accumulate((-(-n // LINE) * LINE for n in sizes.values()), initial=0)
-        *self._starts, total = starts
-        self.scratch = total + LINE if total > MAX_STACK else 0
+        *self._starts, self._total = starts
+        self.scratch = self._total + LINE if self._total > MAX_STACK else 0
         self.lines: list[str] = []
         self.functions: list[str] = []
         self.declarations: dict[str, None] = {}
@@ -261,6 +286,7 @@ class _Writer:
         self._pointers: dict[tuple[int, tuple[tuple[Counter, int], ...]], str] = {}
         self._mask: str | None = None  # the lanes that take part; None for all
         self._read: dict[int, str] = {}  # values of places, in the current piece
+        self.groups = 1
 
     def _new(self) -> str:
         return f"%w{next(self._count)}"
@@ -351,9 +377,9 @@ class _Writer:
             memory = self._field(self._field(lists[True], 8 * (len(self.arrays) - arguments)), DATA)
             memory = self._result(f"getelementptr i8, ptr {memory}, i64 {LINE - 1}")
             self.declarations["declare ptr @llvm.ptrmask.p0.i64(ptr, i64)"] = None
-            first = self._result(f"call ptr @llvm.ptrmask.p0.i64(ptr {memory}, i64 {-LINE})")
+            self._line(f"%places = call ptr @llvm.ptrmask.p0.i64(ptr {memory}, i64 {-LINE})")
             for kind, start in zip(self.places.count, self._starts, strict=True):
-                self._line(f"%{kind}s = getelementptr i8, ptr {first}, i64 {start}")
+                self._line(f"%{kind}s = getelementptr i8, ptr %places, i64 {start}")
 
     def _field(self, pointer: str, offset: int, kind: str = "ptr") -> str:
         """Writes the reading of a field of a structure."""
@@ -361,23 +387,18 @@ class _Writer:
         return self._result(f"load {kind}, ptr {place}")
 
     def worlds(self, program: Sequence[Statement], worlds: int) -> None:
-        """Writes a loop over groups of worlds. The last group ends with the last world."""
-        last = worlds - self.lanes
+        """Writes a loop over all worlds. Its last round ends with the last world."""
+        together = self.lanes * self.groups
+        last = worlds - together
         self._line("br label %group")
         self._label("group")
         self._line("%begun = phi i64 [0, %arrays], [%next, %ended]")
         beyond = self._result(f"icmp sgt i64 %begun, {last}")
         first = self._result(f"select i1 {beyond}, i64 {last}, i64 %begun")
-        if worlds % self.lanes:
-            # worlds that two groups have take part in the first one only: the second one may find
+        if worlds % together:
+            # worlds that two rounds have take part in the first one only: the second one may find
             # results in place of their arguments
-            self._mask = "%fresh"
-            index = self._vector("i64")
-            numbers = ", ".join(f"i64 {k}" for k in range(self.lanes))
-            done = self._result(f"sub i64 %begun, {first}")
-            done = self._result(f"insertelement {index} poison, i64 {done}, i32 0")
-            done = self._result(self._splat(index, done))
-            self._line(f"%fresh = icmp uge {index} <{numbers}>, {done}")
+            self._leave_out(self._result(f"sub i64 %begun, {first}"))
         for k, array in enumerate(self.arrays):
             if array.world:
                 far = self._result(f"mul i64 {first}, {array.world}")
@@ -386,11 +407,23 @@ class _Writer:
         self.block(program)
         self._line("br label %ended")
         self._label("ended")
-        self._line(f"%next = add i64 %begun, {self.lanes}")
+        self._line(f"%next = add i64 %begun, {together}")
         more = self._result(f"icmp slt i64 %next, {worlds}")
         self._line(f"br i1 {more}, label %group, label %end")
         self._label("end")
         self._line("ret ptr null")
+
+    def _leave_out(self, done: str) -> None:
+        """Lets the first worlds of a round take no part; `done` is their number."""
+        self._mask = self._beyond(done, 0)
+
+    def _beyond(self, done: str, group: int) -> str:
+        """Returns the lanes of a group without the first worlds, of a number `done`."""
+        index = self._vector("i64")
+        numbers = ", ".join(f"i64 {group * self.lanes + k}" for k in range(self.lanes))
+        done = self._result(f"insertelement {index} poison, i64 {done}, i32 0")
+        done = self._result(self._splat(index, done))
+        return self._result(f"icmp uge {index} <{numbers}>, {done}")
 
     def block(self, parts: Sequence[Statement]) -> None:
         """Writes the parts of a block."""
@@ -679,3 +712,152 @@ class _Writer:
         if result.dtype.itemsize < x.dtype.itemsize:
             return f"trunc {old} {value} to {new}"
         return f"{'z' if unsigned else 's'}ext {old} {value} to {new}"
+
+
+MASK = 8
+"""The bytes in memory of the mask of a group: enough for 64 lanes."""
+
+
+class _GroupsWriter(_Writer):
+    """Writes a function that evaluates each piece for several groups of lanes.
+
+    A group has places of its own for values, and masks of its own, which lie in memory.
+
+    Attributes:
+        groups: the number of groups.
+    """
+
+    def __init__(
+        self, lanes: int, arrays: Sequence[Layout], places: _Places, groups: int, depth: int
+    ) -> None:
+        super().__init__(lanes, arrays, places)
+        self.groups = groups
+        self.scratch = groups * (self._total + (1 + depth) * MASK) + LINE
+        self._depth: int | None = None  # of the masks of the lanes that take part; None for all
+        self._nested = 0  # branches and loops around the current place
+
+    def start(self, arguments: int) -> None:
+        super().start(arguments)
+        every = self.groups * self._total
+        self._line(f"%masks = getelementptr i8, ptr %places, i64 {every}")
+
+    def _mask_place(self, depth: int, group: int) -> str:
+        """Returns the address of the mask of a group."""
+        offset = (depth * self.groups + group) * MASK
+        return self._result(f"getelementptr i8, ptr %masks, i64 {offset}")
+
+    def _set_masks(self, depth: int, masks: Sequence[str]) -> None:
+        for group, mask in enumerate(masks):
+            place = self._mask_place(depth, group)
+            self._line(f"store {self._vector('i1')} {mask}, ptr {place}")
+
+    def _masks(self) -> list[str]:
+        """Returns the lanes of each group that take part."""
+        if self._depth is None:
+            return [self._value(np.True_)] * self.groups
+        places = [self._mask_place(self._depth, group) for group in range(self.groups)]
+        return [self._result(f"load {self._vector('i1')}, ptr {place}") for place in places]
+
+    def _in_groups(self, flag: Scalar) -> list[str]:
+        """Returns a predicate in each group."""
+        if not isinstance(flag, Register):
+            return [self._value(flag)] * self.groups
+        kind, values = self._vector("i1"), []
+        for group in range(self.groups):
+            place, offset = self._place(flag.number), group * self._total
+            place = self._result(f"getelementptr i8, ptr {place}, i64 {offset}")
+            values.append(self._result(f"load {kind}, ptr {place}"))
+        return values
+
+    def _each(self, operation: str, x: Sequence[str], y: Sequence[str]) -> list[str]:
+        """Returns the combination of the masks of each group."""
+        kind = self._vector("i1")
+        return [self._result(f"{operation} {kind} {a}, {b}") for a, b in zip(x, y, strict=True)]
+
+    def _somewhere(self, masks: Sequence[str]) -> str:
+        """Returns a bit: True if a lane of any group is in its mask."""
+        every = masks[0]
+        for mask in masks[1:]:
+            every = self._result(f"or {self._vector('i1')} {every}, {mask}")
+        return self._any(every)
+
+    def _leave_out(self, done: str) -> None:
+        self._set_masks(0, [self._beyond(done, group) for group in range(self.groups)])
+        self._depth = 0
+
+    def block(self, parts: Sequence[Statement]) -> None:
+        super().block([x._replace(apart=True) if isinstance(x, Piece) else x for x in parts])
+
+    def _function(self, piece: Piece) -> None:
+        used = sorted({(x.address.array, x.address.moves) for x in piece.instructions if x.address})
+        kinds = list(self.places.count)
+        given = [*(f"%{kind}s" for kind in kinds), *(self._pointers[x] for x in used)]
+        names = [f"%{kind}s.all" for kind in kinds] + [f"%a{k}" for k in range(len(used))]
+        if self._depth is not None:
+            given.append(self._mask_place(self._depth, 0))
+            names.append("%masks")
+        name = f"@piece{next(self._count)}"
+        outside = self.lines, self._pointers, self._block
+        self.lines, self._pointers = [], dict(self._pointers)
+        if self._depth is not None:
+            far = self._result(f"mul i64 %group, {MASK}")
+            place = self._result(f"getelementptr i8, ptr %masks, i64 {far}")
+            self._mask = self._result(f"load {self._vector('i1')}, ptr {place}")
+            self._line(f"br i1 {self._any(self._mask)}, label %begin, label %end")
+            self._label("begin")
+        far = self._result(f"mul i64 %group, {self._total}")
+        for kind in kinds:
+            self._line(f"%{kind}s = getelementptr i8, ptr %{kind}s.all, i64 {far}")
+        for k, key in enumerate(used):
+            far = self._result(f"mul i64 %group, {self.lanes * self.arrays[key[0]].world}")
+            self._pointers[key] = self._result(f"getelementptr i8, ptr %a{k}, i64 {far}")
+        self._instructions(piece.instructions)
+        body, (self.lines, self._pointers, self._block) = self.lines, outside
+        self._mask, self._read = None, {}
+        types = [f"ptr {'noalias ' if k < len(kinds) else ''}{x}" for k, x in enumerate(names)]
+        types.append("i64 %group")
+        self.functions += [f"define internal void {name}({', '.join(types)}) noinline nounwind {{"]
+        self.functions += [*body, "br label %end", "end:", "ret void", "}"]
+        for group in range(self.groups):
+            self._line(f"call void {name}({', '.join(f'ptr {x}' for x in given)}, i64 {group})")
+
+    def _branch(self, branch: Branch) -> None:
+        label, before = f"b{next(self._count)}", self._depth
+        self._nested += 1
+        # read before the branch, within which the place of the predicate may have another value
+        which = self._in_groups(branch.which)
+        inverse = self._each("xor", which, [self._value(np.True_)] * self.groups)
+        for part, flags, body in (("", which, branch.taken), ("e", inverse, branch.others)):
+            if not body:
+                continue
+            self._depth = before
+            masks = flags if before is None else self._each("and", flags, self._masks())
+            self._set_masks(self._nested, masks)
+            some = self._somewhere(masks)
+            self._line(f"br i1 {some}, label %{label}{part}, label %{label}{part}n")
+            self._label(f"{label}{part}")
+            self._depth = self._nested
+            self.block(body)
+            self._line(f"br label %{label}{part}n")
+            self._label(f"{label}{part}n")
+        self._depth = before
+        self._nested -= 1
+
+    def _loop(self, loop: Loop) -> None:
+        label, before = f"l{next(self._count)}", self._depth
+        self._nested += 1
+        self._set_masks(self._nested, self._masks())
+        self._depth = self._nested
+        self._line(f"br label %{label}")
+        self._label(label)
+        self.block(loop.condition)
+        active = self._each("and", self._in_groups(loop.goes_on), self._masks())
+        self._set_masks(self._nested, active)
+        some = self._somewhere(active)
+        self._line(f"br i1 {some}, label %{label}b, label %{label}n")
+        self._label(f"{label}b")
+        self.block(loop.body)
+        self._line(f"br label %{label}")
+        self._label(f"{label}n")
+        self._depth = before
+        self._nested -= 1
