@@ -433,9 +433,22 @@ def studies(quick: bool) -> dict[str, tuple[tuple[str, ...], int, Any]]:
     return found
 
 
+def composed(name: str) -> tuple[tuple[str, ...], int, Any]:
+    """Returns elements, dimension and method of a study from a name such as "nearest, 3D, ropes".
+
+    Raises:
+        KeyError: no method of `SETS` has this name, or it has no such element.
+    """
+    method, dim, *elements = name.split(", ")
+    known, chosen = SETS[method]
+    if unknown := set(elements) - set(known):
+        raise KeyError(f"{name}: no elements {sorted(unknown)}; known are {sorted(known)}.")
+    return tuple(elements), int(dim.removesuffix("D")), chosen
+
+
 def measure(name: str, quick: bool) -> Counts:
     """Runs one study and returns its counts."""
-    elements, dim, method = studies(quick=False)[name]
+    elements, dim, method = studies(quick=False).get(name) or composed(name)
     every = {**JOINTS, **FORCES, **ENDS}
     system, state = stage(dim, {element: every[element] for element in elements})
     return Study(system, state, method, thorough=not quick).run()
@@ -459,14 +472,20 @@ def main(given: list[str] | None = None) -> int:
     """Prints the counts of the studies. The exit status is 1 if a case went wrong."""
     text = argparse.RawDescriptionHelpFormatter
     parser = argparse.ArgumentParser("benchmarks.poisoned", None, __doc__, formatter_class=text)
-    parser.add_argument("names", nargs="*", help="parts of the names of studies")
+    parser.add_argument(
+        "names",
+        nargs="*",
+        help="parts of the names of studies, or whole names as in --list, of any elements",
+    )
     parser.add_argument("--quick", action="store_true", help="the small studies of the tests")
     parser.add_argument("--list", action="store_true", help="the names alone")
     options = parser.parse_args(given)
     jax.config.update("jax_enable_x64", True)
     names = [
         name
-        for name in studies(options.quick)
+        for name in dict.fromkeys(
+            [*studies(options.quick), *(x for x in options.names if "D, " in x)]
+        )
         if not options.names or any(part in name for part in options.names)
     ]
     total = Counts()
