@@ -433,22 +433,25 @@ def studies(quick: bool) -> dict[str, tuple[tuple[str, ...], int, Any]]:
     return found
 
 
-def composed(name: str) -> tuple[tuple[str, ...], int, Any]:
-    """Returns elements, dimension and method of a study from a name such as "nearest, 3D, ropes".
+def composed(name: str) -> tuple[tuple[str, ...], int, Any] | None:
+    """Returns elements, dimension and method of a study named like "nearest, 3D, slack rope".
 
-    Raises:
-        KeyError: no method of `SETS` has this name, or it has no such element.
+    The result is None for other names.
     """
-    method, dim, *elements = name.split(", ")
-    known, chosen = SETS[method]
-    if unknown := set(elements) - set(known):
-        raise KeyError(f"{name}: no elements {sorted(unknown)}; known are {sorted(known)}.")
-    return tuple(elements), int(dim.removesuffix("D")), chosen
+    method, _, rest = name.partition(", ")
+    dim, _, listed = rest.partition(", ")
+    elements, (known, chosen) = listed.split(", "), SETS.get(method, ({}, None))
+    if dim not in ("2D", "3D") or not known or set(elements) - set(known):
+        return None
+    return tuple(elements), int(dim[0]), chosen
 
 
 def measure(name: str, quick: bool) -> Counts:
     """Runs one study and returns its counts."""
-    elements, dim, method = studies(quick=False).get(name) or composed(name)
+    study = studies(quick=False).get(name) or composed(name)
+    if study is None:
+        raise KeyError(f"there is no study named {name!r}")
+    elements, dim, method = study
     every = {**JOINTS, **FORCES, **ENDS}
     system, state = stage(dim, {element: every[element] for element in elements})
     return Study(system, state, method, thorough=not quick).run()
@@ -481,13 +484,10 @@ def main(given: list[str] | None = None) -> int:
     parser.add_argument("--list", action="store_true", help="the names alone")
     options = parser.parse_args(given)
     jax.config.update("jax_enable_x64", True)
-    names = [
-        name
-        for name in dict.fromkeys(
-            [*studies(options.quick), *(x for x in options.names if "D, " in x)]
-        )
-        if not options.names or any(part in name for part in options.names)
-    ]
+    whole = [name for name in options.names if composed(name)]
+    parts = [name for name in options.names if name not in whole]
+    every = studies(options.quick)
+    names = whole + [x for x in every if not options.names or any(part in x for part in parts)]
     total = Counts()
     for name in names:
         if options.list:
