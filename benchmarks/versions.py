@@ -127,6 +127,12 @@ def offered(python: str) -> list[str]:
     return match[1].split(", ") if match else []
 
 
+def _packages(record: Path) -> dict[str, str]:
+    """Reads the versions of installed packages from the output of `pip freeze`, if it exists."""
+    lines = record.read_text().splitlines() if record.exists() else []
+    return dict(x.split("==") for x in lines if "==" in x)
+
+
 class Pair:
     """A version of Python with a version of JAX, and its test results.
 
@@ -166,11 +172,13 @@ class Pair:
         self.found["time"] = f"{(time.monotonic() - start) / 60:.0f} min"
 
     def _installed(self, place: Path, end: float) -> bool:
-        """Creates the environment unless it exists. Returns True if it exists afterwards."""
-        record = place / "versions.txt"
-        if not record.exists():
-            needed = project()["dependencies"]
-            bounds = lower_bounds(needed)
+        """Creates the environment unless it exists. Returns True if it exists afterwards.
+
+        An environment that lacks a dependency is from before it was one, and is created again.
+        """
+        record, needed = place / "versions.txt", project()["dependencies"]
+        bounds = lower_bounds(needed)
+        if not bounds.keys() <= _packages(record).keys():
             others = [f"{k}=={v}" for k, v in bounds.items()] if self.lowest else needed
             exact = {f"jax=={self.jax}", f"jaxlib=={self.jax}"}
             wanted = [*exact, *(x for x in others if not x.startswith("jax"))]
@@ -185,7 +193,7 @@ class Pair:
                 if text is None:
                     return False
             record.write_text(text)
-        packages = dict(x.split("==") for x in record.read_text().splitlines() if "==" in x)
+        packages = _packages(record)
         self.found["install"] = ", ".join(
             f"{x} {packages[x]}" for x in ("llvmlite", "numpy", "optax")
         )

@@ -649,6 +649,51 @@ def test_loops_that_are_not_written_round_by_round(platform, function, monkeypat
     check_operations(platform, function, (ARRAY,))
 
 
+def through_rows(x):
+    """Loops in both directions whose rows, long and of all kinds, lie in no argument or result."""
+
+    def forth(carry, row):
+        carry = jnp.sin(carry) + row.sum(0) * x[0]
+        return carry, (carry[:, None] * row.T, carry > 0.2, jnp.sum(carry > 0, dtype=jnp.int32))
+
+    def back(carry, rows):
+        numbers, flags, count = rows
+        carry = 0.5 * carry + jnp.where(flags, numbers.sum(1), count.astype(x.dtype))
+        return carry, carry * numbers[:, 0]
+
+    wide = jnp.cos(jnp.arange(60, dtype=x.dtype)).reshape(5, 6, 2) * x[0, 0]
+    middle, rows = jax.lax.scan(forth, x[0], wide)
+    last, ends = jax.lax.scan(back, middle, rows, reverse=True)
+    return last, ends[1] * 2 + rows[0][3, 1, 0], jax.lax.scan(back, last, rows)[0]
+
+
+@pytest.mark.parametrize("worlds", [3, 37])
+@pytest.mark.parametrize("long", [False, True])
+def test_rows_of_long_loops_lie_in_local_arrays(worlds, long, monkeypatch):
+    """Values and gradients, in threads that take part and in others, and round after round."""
+    for limit in ("MAX_UNROLLED", "MAX_UNROLLED_HELD", "MAX_ITERATED", "MAX_HELD", "MAX_CHOSEN"):
+        monkeypatch.setattr(entries, limit, 0)
+    if long:
+        monkeypatch.setattr(cpu, "LONG", 0)
+
+    def function(x):
+        turn = lambda c, _: (through_rows(c)[2][None] + c, None)  # noqa: E731
+        thrice = lambda y: jax.lax.scan(turn, y, None, 3)[0]  # noqa: E731
+        some = jax.lax.cond(x[0, 0] > 0, thrice, lambda y: y, x)
+        slope = jax.grad(lambda y: jnp.sum(through_rows(y)[0] ** 2))(x)
+        return *through_rows(x), some, slope
+
+    x = np.random.default_rng(worlds).standard_normal((worlds, 3, 2))
+    one = jax.make_jaxpr(function)(x[0])
+    lengths = []
+    count = kernels.count_of
+    monkeypatch.setattr(kernels, "count_of", lambda x: lengths.append(count(x)) or lengths[-1])
+    here = kernels.run_worlds(PLATFORMS["cpu"], one, [jnp.asarray(x)], [0], worlds)
+    for a, b in zip(here, expected(jax.vmap(function), x), strict=True):
+        np.testing.assert_allclose(np.moveaxis(np.asarray(a), -1, 0), b, rtol=1e-11, atol=1e-11)
+    assert lengths[0] < 4000  # loops, not rounds one by one
+
+
 def check_operations(platform, function, args):
     here = evaluated(platform, function, *map(np.asarray, args))
     for x, y in zip(here, expected(function, *args), strict=True):

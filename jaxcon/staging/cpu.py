@@ -26,7 +26,7 @@ from jax.interpreters import mlir
 
 from jaxcon.staging import llvm
 from jaxcon.staging.kernels import NAME, called, kernel_p
-from jaxcon.staging.thread import Instruction, Layout, Statement, count_of
+from jaxcon.staging.thread import Instruction, Layout, Local, Statement, count_of
 
 OPTIMIZATION = 1
 """LLVM's level of optimization. At level 2, code is no faster and takes longer to compile."""
@@ -49,14 +49,20 @@ class Cpu:
     max_length = 800_000
     max_arrays = 10_000
     max_places = 24
+    max_local = 16_384
 
     def text(
-        self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
+        self,
+        program: Sequence[Statement],
+        worlds: int,
+        arrays: Sequence[Layout],
+        results: int,
+        local: Sequence[Local],
     ) -> str:
         """Returns the text of a kernel."""
         lanes = min(_register_bytes() // _size(program), 1 << (worlds.bit_length() - 1))
         groups = min(GROUPS, worlds // lanes) if count_of(program) > LONG else 1
-        return llvm.text(program, NAME, worlds, arrays, results, lanes, groups)
+        return llvm.text(program, NAME, worlds, arrays, results, lanes, groups, local)
 
 
 def _size(program: Sequence[Statement]) -> int:

@@ -15,7 +15,7 @@ from jax.interpreters import mlir
 from jaxcon.staging import ptx
 from jaxcon.staging.kernels import NAME, called, kernel_p
 from jaxcon.staging.ptx import BLOCK
-from jaxcon.staging.thread import Layout, Statement
+from jaxcon.staging.thread import Layout, Local, Statement
 
 TARGET = "__gpu$xla.gpu.ptx"
 """XLA's name of a call of a kernel that is given as text."""
@@ -31,9 +31,15 @@ class Cuda:
     max_length = 75_000
     max_arrays = 500
     max_places = 64
+    max_local = 0
 
     def text(
-        self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
+        self,
+        program: Sequence[Statement],
+        worlds: int,
+        arrays: Sequence[Layout],
+        results: int,
+        local: Sequence[Local],
     ) -> str:
         """Returns the text of a kernel."""
         return ptx.text(program, NAME, worlds, arrays)

@@ -91,9 +91,17 @@ class Stored:
 
     Attributes:
         shape, dtype: those of the array.
+        local: True for a local array.
     """
 
-    def __init__(self, thread: Thread, first: Address, shape: tuple[int, ...], dtype: Any) -> None:
+    def __init__(
+        self,
+        thread: Thread,
+        first: Address,
+        shape: tuple[int, ...],
+        dtype: Any,
+        local: bool = False,
+    ) -> None:
         """Names an array in memory.
 
         Args:
@@ -101,8 +109,9 @@ class Stored:
             first: the address of its first entry.
             shape: its shape.
             dtype: its dtype.
+            local: True for a local array.
         """
-        self.thread, self.first = thread, first
+        self.thread, self.first, self.local = thread, first, local
         self.shape, self.dtype = tuple(shape), np.dtype(dtype)
 
     def address(self, entry: int) -> Address:
@@ -115,8 +124,9 @@ class Stored:
         if math.prod(self.shape) > MAX_LOADS:
             raise UnsupportedError(f"an array of shape {self.shape} outside of a loop")
         result = np.empty(self.shape, object)
+        read = self.thread.fetch if self.local else self.thread.load
         for entry, place in enumerate(np.ndindex(self.shape)):
-            result[place] = self.thread.load(self.address(entry), self.dtype)
+            result[place] = read(self.address(entry), self.dtype)
         return result
 
     def write(self, values: Entries) -> None:
@@ -126,22 +136,29 @@ class Stored:
 
     def reshaped(self, shape: tuple[int, ...]) -> Stored:
         """Returns the array in another shape."""
-        return Stored(self.thread, self.first, shape, self.dtype)
+        return Stored(self.thread, self.first, shape, self.dtype, self.local)
 
-    def row(self, index: int | Counter) -> Stored:
-        """Returns the slice at an index of the first axis, which may be the round of a loop."""
+    def row(self, index: int | Counter, backward: bool = False) -> Stored:
+        """Returns the slice at an index of the first axis, which may be the round of a loop.
+
+        Args:
+            index: the index.
+            backward: True if the first round of the loop has the last slice.
+        """
         size, first = math.prod(self.shape[1:]), self.first
         if isinstance(index, Counter):
-            first = first._replace(moves=(*first.moves, (index, size)))
+            step, start = (-size, (self.shape[0] - 1) * size) if backward else (size, 0)
+            moves = (*first.moves, (index, step))
+            first = first._replace(entry=first.entry + start, moves=moves)
         else:
             first = first._replace(entry=first.entry + index * size)
-        return Stored(self.thread, first, self.shape[1:], self.dtype)
+        return Stored(self.thread, first, self.shape[1:], self.dtype, self.local)
 
 
 class _Nowhere:
     """Takes the place of an array in memory for a result that nothing reads."""
 
-    def row(self, index: int | Counter) -> _Nowhere:
+    def row(self, index: int | Counter, backward: bool = False) -> _Nowhere:
         """Returns itself."""
         return self
 
@@ -172,15 +189,16 @@ def _body(closed: ClosedJaxpr, constants: Sequence[Constant | None]) -> Any:
 class Evaluation:
     """The evaluation of programs by one thread."""
 
-    def __init__(self, thread: Thread, max_places: int) -> None:
+    def __init__(self, thread: Thread, max_places: int, max_local: int = 0) -> None:
         """Begins an evaluation.
 
         Args:
             thread: the thread.
             max_places: the largest number of places of a slice at an index that is not known,
                 within a loop that is not written round by round.
+            max_local: the largest number of entries of all local arrays.
         """
-        self.thread, self._max_places = thread, max_places
+        self.thread, self._max_places, self._max_local = thread, max_places, max_local
         # where the results of a loop go, by the number of the value in the outermost program
         self._sinks: dict[int, Stored | _Nowhere] = {}
         self._repeating = False  # within a loop of a known number of rounds
@@ -425,14 +443,18 @@ class Evaluation:
             for x, place in zip(body.closed.jaxpr.outvars[carries:], places, strict=True)
             if not place
         ]
-        fits = self._fit(rows) and length * sum(held) <= MAX_HELD
-        repeats = length > 1 and fits and not params["reverse"]
+        backward = params["reverse"]
+        in_registers = self._fit(rows) and length * sum(held) <= MAX_HELD and not backward
+        chosen = sum(x.size for x in rows if isinstance(x, np.ndarray))
+        room = self._max_local - sum(x.entries for x in self.thread.local)
+        spills = not in_registers and chosen + length * sum(held) <= room
+        repeats = length > 1 and (in_registers or spills)
         if length > MAX_ROUNDS and repeats and not held:
-            return self._repeat(body, fixed, carried, rows, places, length)
+            return self._repeat(body, fixed, carried, rows, places, length, spills, backward)
         if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
         same = not any(x is not None for x in rows) and not places and not _counts(body, constants)
-        limit = MAX_ITERATED if same else MAX_UNROLLED_HELD if held else MAX_UNROLLED
+        limit = MAX_ITERATED if same else MAX_UNROLLED_HELD if held or spills else MAX_UNROLLED
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
 
@@ -440,18 +462,18 @@ class Evaluation:
             given = [_row(x, k, aval) for x, aval in zip(rows, kinds, strict=True)]
             return self(body, [*fixed, *carried, *given])
 
-        order = range(length)
-        for k in reversed(order) if params["reverse"] else order:
+        order = range(length)[:: -1 if backward else 1]
+        for k in order:
             # indices that count rounds are known numbers if the loop is written round by round
-            most = limit // length if repeats and k == 0 else None
+            most = limit // length if repeats and k == order[0] else None
             extra = self._extra
             both = self.thread.tried(lambda k=k: one(k), most)
             if both is None:
                 self._extra = extra
-                return self._repeat(body, fixed, carried, rows, places, length)
+                return self._repeat(body, fixed, carried, rows, places, length, spills, backward)
             carried = both[:carries]
             results.append(both[carries:])
-        if params["reverse"]:
+        if backward:
             results.reverse()
         return [*carried, *(np.stack(x) for x in zip(*results, strict=True))]
 
@@ -463,6 +485,8 @@ class Evaluation:
         rows: Sequence[Stored | Entries | None],
         places: Sequence[Any],
         length: int,
+        spills: bool,
+        backward: bool,
     ) -> list[Any]:
         """Writes a loop that runs a body `length` times on carried values.
 
@@ -472,11 +496,22 @@ class Evaluation:
             start: the carried values at the start.
             rows: arrays of which each round reads a row; None if the body does not read it.
             places: arrays of which each round writes a row; None for rows that are held in
-                registers.
+                registers, or in local arrays.
             length: the number of rounds.
+            spills: True if rows that are not in memory are moved to local arrays.
+            backward: True if rounds go from the last row to the first one.
         """
         kinds = [x.aval for x in body.closed.jaxpr.invars[len(fixed) + len(start) :]]
         written = [x.aval for x in body.closed.jaxpr.outvars[len(start) :]]
+        if spills:
+            rows = [
+                self._spilled(x, aval.dtype) if isinstance(x, np.ndarray) else x
+                for x, aval in zip(rows, kinds, strict=True)
+            ]
+            places = [
+                place or self._local((length, *x.shape), x.dtype)
+                for x, place in zip(written, places, strict=True)
+            ]
         before = self.thread.length + self._extra
         held = [
             entries(np.zeros((length, *x.shape), x.dtype))
@@ -492,7 +527,9 @@ class Evaluation:
         def run(counter: Counter, carried: Sequence[Scalar]) -> list[Scalar]:
             index, numbers = carried[: len(count)], carried[len(count) :]
             given = [
-                self._chosen(x, index[0]) if isinstance(x, np.ndarray) else _row(x, counter, aval)
+                self._chosen(x, index[0])
+                if isinstance(x, np.ndarray)
+                else _row(x, counter, aval, backward)
                 for x, aval in zip(rows, kinds, strict=True)
             ]
             arrays = _unflattened(numbers, shapes)
@@ -501,7 +538,7 @@ class Evaluation:
             following = results[: len(start)]
             for x, place in zip(results[len(start) :], places, strict=True):
                 if place:
-                    place.row(counter).write(x)
+                    place.row(counter, backward).write(x)
                 else:
                     following.append(self._with_row(next(kept), x, index[0]))
             return [*(self.thread.apply("add", x, np.int32(1)) for x in index), *_flat(following)]
@@ -517,6 +554,17 @@ class Evaluation:
         arrays = _unflattened(final, shapes)
         kept = iter(arrays[len(start) :])
         return [*arrays[: len(start)], *(place or next(kept) for place in places)]
+
+    def _local(self, shape: tuple[int, ...], dtype: Any) -> Stored:
+        """Returns a new local array."""
+        first = self.thread.allocate(math.prod(shape), dtype)
+        return Stored(self.thread, first, shape, dtype, local=True)
+
+    def _spilled(self, x: Entries, dtype: Any) -> Stored:
+        """Writes an array to a new local array, and returns that."""
+        result = self._local(x.shape, dtype)
+        result.write(x)
+        return result
 
     def _with_row(self, rows: Entries, x: Entries, index: Any) -> Entries:
         """Writes the replacement of the row at an index by x."""
@@ -774,12 +822,12 @@ def _read(x: Any) -> Any:
     return x.entries if isinstance(x, Stored) else x
 
 
-def _row(x: Any, index: int | Counter, aval: Any) -> Any:
+def _row(x: Any, index: int | Counter, aval: Any, backward: bool = False) -> Any:
     """Returns the slice of an array at an index of its first axis; zeros if it is not needed."""
     if x is None:
         return entries(np.zeros(aval.shape, np.int32))
     if isinstance(x, Stored):
-        return x.row(index)
+        return x.row(index, backward)
     return np.take(x, [index], 0).squeeze(0)
 
 

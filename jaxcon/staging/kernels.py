@@ -36,6 +36,7 @@ from jaxcon.staging.entries import Evaluation, Stored
 from jaxcon.staging.thread import (
     Address,
     Layout,
+    Local,
     Statement,
     Thread,
     UnsupportedError,
@@ -65,14 +66,21 @@ class Platform(Protocol):
         max_places: the largest number of places of a slice at an index that is not known, within a
             loop of a known number of rounds. An entry is chosen among those of all places, and such
             loops take many slices.
+        max_local: the largest number of entries of all local arrays of a thread.
     """
 
     max_length: int
     max_arrays: int
     max_places: int
+    max_local: int
 
     def text(
-        self, program: Sequence[Statement], worlds: int, arrays: Sequence[Layout], results: int
+        self,
+        program: Sequence[Statement],
+        worlds: int,
+        arrays: Sequence[Layout],
+        results: int,
+        local: Sequence[Local],
     ) -> str:
         """Returns the text of a kernel.
 
@@ -81,6 +89,7 @@ class Platform(Protocol):
             worlds: the number of worlds.
             arrays: the layouts of all arrays.
             results: the number of arrays that are results; they are the last ones.
+            local: the local arrays, whose numbers follow.
         """
         ...
 
@@ -237,9 +246,10 @@ def _kernel(
         raise UnsupportedError("no worlds, or random keys")
     if len(dtypes) > platform.max_arrays:
         raise UnsupportedError(f"{len(dtypes)} arrays")
-    program = _program(closed, streams, platform.max_places)
-    if isinstance(program, str):
-        raise UnsupportedError(program)
+    written = _program(closed, streams, platform.max_places, platform.max_local)
+    if isinstance(written, str):
+        raise UnsupportedError(written)
+    program, local = written
     if (length := count_of(program)) > platform.max_length:
         raise UnsupportedError(f"{length} instructions")
     sizes = [np.dtype(x).itemsize for x in dtypes]
@@ -248,22 +258,29 @@ def _kernel(
         Layout(n, worlds * n) if flag else Layout(0, n)
         for n, flag in zip(sizes, flags, strict=True)
     ]
-    text = platform.text(program, worlds, arrays, len(results))
+    text = platform.text(program, worlds, arrays, len(results), local)
     return text, tuple(((*x.shape, worlds), x.dtype) for x in results)
 
 
 @functools.lru_cache(maxsize=8)  # a program of a robot takes tens of megabytes
-def _program(closed: ClosedJaxpr, streams: bool, max_places: int) -> list[Statement] | str:
-    """Returns the program of a thread that evaluates a jaxpr, or why there is none."""
-    thread = Thread()
+def _program(
+    closed: ClosedJaxpr, streams: bool, max_places: int, max_local: int
+) -> tuple[list[Statement], list[Local]] | str:
+    """Returns the program of a thread that evaluates a jaxpr, or why there is none.
+
+    Returns:
+        The program and its local arrays, or a reason.
+    """
     kinds = [x.aval for x in (*closed.jaxpr.invars, *closed.jaxpr.outvars)]
+    thread = Thread(len(kinds))
     arrays = [Stored(thread, Address(k), x.shape, x.dtype) for k, x in enumerate(kinds)]
     count = len(closed.jaxpr.invars)
     try:
-        Evaluation(thread, max_places).store(closed, arrays[:count], arrays[count:], streams)
+        evaluation = Evaluation(thread, max_places, max_local)
+        evaluation.store(closed, arrays[:count], arrays[count:], streams)
     except UnsupportedError as error:
         return str(error)
-    return thread.program()
+    return thread.program(), thread.local
 
 
 def _abstract(

@@ -34,6 +34,7 @@ from jaxcon.staging.thread import (
     Counter,
     Instruction,
     Layout,
+    Local,
     Loop,
     Piece,
     Register,
@@ -100,6 +101,7 @@ def text(
     results: int,
     lanes: int,
     groups: int = 1,
+    local: Sequence[Local] = (),
 ) -> str:
     """Returns the text of a function that evaluates a program in all worlds.
 
@@ -114,13 +116,14 @@ def text(
         results: the number of arrays that are results; they are the last ones.
         lanes: the number of worlds that are evaluated together.
         groups: the number of groups of lanes for which each piece is evaluated.
+        local: the local arrays.
     """
     parts = _in_pieces(program)
     places = _Places(parts)
     writer = (
-        _Writer(lanes, arrays, places)
+        _Writer(lanes, arrays, local, places)
         if groups == 1
-        else _GroupsWriter(lanes, arrays, places, groups, _depth(parts))
+        else _GroupsWriter(lanes, arrays, local, places, groups, _depth(parts))
     )
     writer.start(len(arrays) - results)
     writer.worlds(parts, worlds)
@@ -210,9 +213,13 @@ class _Places:
     def _instruction(self, instruction: Instruction) -> None:
         self._position += 1
         for x in instruction.operands:
-            self._use(x)
-        if instruction.name in WRITES:
+            if instruction.name != "fetch":
+                self._use(x)
+        if instruction.name == "fetch":  # the only one that writes its register
             register: Any = instruction.operands[0]
+            self._made[register.number] = self._position, self._piece
+        elif instruction.name in WRITES:
+            register = instruction.operands[0]
             self._shared[register.number] = register
         elif instruction.result is not None:
             self._made[instruction.result.number] = self._position, self._piece
@@ -271,13 +278,27 @@ class _Writer:
         declarations: the declarations of the functions that it calls; a mapping keeps each once.
     """
 
-    def __init__(self, lanes: int, arrays: Sequence[Layout], places: _Places) -> None:
-        self.lanes, self.arrays, self.places = lanes, arrays, places
+    groups = 1
+
+    def __init__(
+        self, lanes: int, arrays: Sequence[Layout], local: Sequence[Local], places: _Places
+    ) -> None:
+        self.lanes, self.places = lanes, places
+        own = [x.dtype.itemsize for x in local]
+        # entries of a local array are those of all groups
+        self.arrays = [*arrays, *(Layout(n, n * lanes * self.groups) for n in own)]
+        self._count_given = len(arrays)
         self._types = {dtype: self._vector(kind) for dtype, kind in TYPES.items()}
         sizes = {kind: n * self._bytes(kind) for kind, n in places.count.items()}
         starts = itertools.accumulate((-(-n // LINE) * LINE for n in sizes.values()), initial=0)
         *self._starts, self._total = starts
-        self.scratch = self._total + LINE if self._total > MAX_STACK else 0
+        spans = [
+            -(-x.entries * a.entry // LINE) * LINE
+            for x, a in zip(local, self.arrays[len(arrays) :], strict=True)
+        ]
+        *self._local, self._total_local = itertools.accumulate(spans, initial=0)
+        needs = self._total + self._total_local
+        self.scratch = needs + LINE if local or self._total > MAX_STACK else 0
         self.lines: list[str] = []
         self.functions: list[str] = []
         self.declarations: dict[str, None] = {}
@@ -286,7 +307,6 @@ class _Writer:
         self._pointers: dict[tuple[int, tuple[tuple[Counter, int], ...]], str] = {}
         self._mask: str | None = None  # the lanes that take part; None for all
         self._read: dict[int, str] = {}  # values of places, in the current piece
-        self.groups = 1
 
     def _new(self) -> str:
         return f"%w{next(self._count)}"
@@ -368,18 +388,24 @@ class _Writer:
         self._line("ret ptr null")
         self._label("arrays")
         lists = [self._field("%frame", FRAME[key]) for key in ("arguments", "results")]
-        for k in range(len(self.arrays)):
+        for k in range(self._count_given):
             of_results = k >= arguments
             place = 8 * (k - arguments if of_results else k)
             array = self._field(lists[of_results], place)
             self._pointers[k, ()] = self._field(array, DATA)
         if self.scratch:
-            memory = self._field(self._field(lists[True], 8 * (len(self.arrays) - arguments)), DATA)
+            memory = self._field(
+                self._field(lists[True], 8 * (self._count_given - arguments)), DATA
+            )
             memory = self._result(f"getelementptr i8, ptr {memory}, i64 {LINE - 1}")
             self.declarations["declare ptr @llvm.ptrmask.p0.i64(ptr, i64)"] = None
             self._line(f"%places = call ptr @llvm.ptrmask.p0.i64(ptr {memory}, i64 {-LINE})")
             for kind, start in zip(self.places.count, self._starts, strict=True):
                 self._line(f"%{kind}s = getelementptr i8, ptr %places, i64 {start}")
+            for k, start in enumerate(self._local, self._count_given):
+                offset = start + self.groups * self._total
+                place = self._result(f"getelementptr i8, ptr %places, i64 {offset}")
+                self._pointers[k, ()] = place
 
     def _field(self, pointer: str, offset: int, kind: str = "ptr") -> str:
         """Writes the reading of a field of a structure."""
@@ -399,7 +425,7 @@ class _Writer:
             # worlds that two rounds have take part in the first one only: the second one may find
             # results in place of their arguments
             self._leave_out(self._result(f"sub i64 %begun, {first}"))
-        for k, array in enumerate(self.arrays):
+        for k, array in enumerate(self.arrays[: self._count_given]):
             if array.world:
                 far = self._result(f"mul i64 {first}, {array.world}")
                 start = self._pointers[k, ()]
@@ -468,6 +494,9 @@ class _Writer:
         for instruction in instructions:
             match instruction:
                 case Instruction("load", Register() as result, address=Address() as address):
+                    self._load(result, address)
+                    self._keep(result, f"%v{result.number}")
+                case Instruction("fetch", _, (Register() as result,), address=Address() as address):
                     self._load(result, address)
                     self._keep(result, f"%v{result.number}")
                 case Instruction("store", _, (x,), address=Address() as address):
@@ -728,17 +757,24 @@ class _GroupsWriter(_Writer):
     """
 
     def __init__(
-        self, lanes: int, arrays: Sequence[Layout], places: _Places, groups: int, depth: int
+        self,
+        lanes: int,
+        arrays: Sequence[Layout],
+        local: Sequence[Local],
+        places: _Places,
+        groups: int,
+        depth: int,
     ) -> None:
-        super().__init__(lanes, arrays, places)
         self.groups = groups
-        self.scratch = groups * (self._total + (1 + depth) * MASK) + LINE
+        super().__init__(lanes, arrays, local, places)
+        masks = groups * (1 + depth) * MASK
+        self.scratch = groups * self._total + self._total_local + masks + LINE
         self._depth: int | None = None  # of the masks of the lanes that take part; None for all
         self._nested = 0  # branches and loops around the current place
 
     def start(self, arguments: int) -> None:
         super().start(arguments)
-        every = self.groups * self._total
+        every = self.groups * self._total + self._total_local
         self._line(f"%masks = getelementptr i8, ptr %places, i64 {every}")
 
     def _mask_place(self, depth: int, group: int) -> str:

@@ -30,7 +30,7 @@ MAX_REGISTERS = 1_000_000
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64", "bool")}
 """The dtypes of registers."""
 
-WRITES = ("set", "assign")
+WRITES = ("set", "assign", "fetch")
 """Instructions that write their first operand."""
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
@@ -60,6 +60,13 @@ class Register:
 
 Scalar = Register | np.generic
 """A number in a register, or one that is known."""
+
+
+class Local(NamedTuple):
+    """An array of numbers of a thread in memory that the kernel needs for itself."""
+
+    entries: int
+    dtype: np.dtype
 
 
 class Counter(NamedTuple):
@@ -103,12 +110,13 @@ class Instruction(NamedTuple):
             the dtype of the result; `select` (predicate, if true, if false); `load` and `store`;
             `set` and `assign`, which write the second operand to the first one, a register. Threads
             that do not take part in a branch or in a round keep the register after `assign`, and
-            may lose it after `set`.
+            may lose it after `set`. `fetch` reads a local array into its first operand. Unlike
+            `load`, it keeps its place after all that is written before.
         result: the register of its result, which no other instruction writes; None if the
             instruction must be kept.
         operands: its operands.
         reads: the numbers of the registers that it reads.
-        address: the place in memory of `load` and `store`.
+        address: the place in memory of `load`, `store` and `fetch`.
     """
 
     name: str
@@ -181,11 +189,19 @@ class Thread:
     Attributes:
         statements: the statements written so far, in the block that is being written.
         length: the number of instructions written so far.
+        local: the local arrays, whose numbers follow those of arguments and results.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, arrays: int = 0) -> None:
+        """Begins a program.
+
+        Args:
+            arrays: the number of arrays that are arguments or results.
+        """
         self.statements: list[Statement] = []
         self.length = 0
+        self.local: list[Local] = []
+        self._arrays = arrays
         self._limit = math.inf  # the length at which a trial ends
         self._count = itertools.count()
         # results of instructions, by instruction and operands; an inner table for each loop or
@@ -236,6 +252,18 @@ class Thread:
         """
         result = self.new(dtype)
         self._append(Instruction("load", result, (), (), address))
+        return result
+
+    def allocate(self, entries: int, dtype: Any) -> Address:
+        """Returns the first place of a new local array."""
+        _check(np.dtype(dtype))
+        self.local.append(Local(entries, np.dtype(dtype)))
+        return Address(self._arrays + len(self.local) - 1)
+
+    def fetch(self, address: Address, dtype: Any) -> Register:
+        """Reads a number from a local array, after all that was written to it before."""
+        result = self.new(dtype)
+        self._append(Instruction("fetch", None, (result,), (), address))
         return result
 
     def store(self, address: Address, x: Scalar) -> None:
@@ -370,6 +398,7 @@ class Thread:
         if max_length is None:
             return write()
         before, limit, depth = self.length, self._limit, len(self._known)
+        arrays = len(self.local)
         outside, self.statements = self.statements, []
         self._known.append({})
         self._limit = min(limit, before + max_length)
@@ -378,7 +407,7 @@ class Thread:
         except _TooLongError:
             if limit <= before + max_length:  # an outer trial ends first
                 raise
-            del self._known[depth:]
+            del self._known[depth:], self.local[arrays:]
             self.length, self.statements = before, outside
             return None
         finally:
@@ -540,13 +569,15 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
             # the last one on the stack is placed first
             stack += [(x, False) for x in sorted(operands, key=needs.__getitem__)]
 
-    def is_write(statement: Statement) -> bool:
-        return isinstance(statement, Instruction)
+    def kind(statement: Statement) -> str:
+        if isinstance(statement, Instruction):
+            return "fetch" if statement.name == "fetch" else "write"
+        return "block"
 
     kept = (x for x in statements if not isinstance(x, Instruction) or x.result is None)
-    for writes, group in itertools.groupby(kept, is_write):
+    for what, group in itertools.groupby(kept, kind):
         roots: list[Any] = list(group)
-        if writes:
+        if what != "block":  # later writes of a group do not depend on earlier ones
             place([x for root in roots for x in root.reads])
             placed += roots
             continue
