@@ -273,7 +273,8 @@ class Response:
             solve = _of_column(equations.solver(system))
         else:
             solver = add_rhs_axis(dynamics.solver, system.force.ndim - 1)
-            solve = solver.factor(add_rhs_axis(system, system.force.ndim - 1))
+            columns = add_rhs_axis(system, system.force.ndim - 1)
+            solve = solver.factor(dataclasses.replace(columns, has_columns=True))
         return ContactProblem.of(
             rows, solve, system, dt, acts, self._leaves_out(rows), share, regularization, equations
         )

@@ -97,14 +97,17 @@ class RankSafe(checks.Checked, Solver):
         margin = float(jnp.finfo(system.target.dtype).eps) ** (3 / 8)
         direct, independent = self.solver.checked(system, margin, leaves_out=True)
 
+        def each(solve: Factored) -> Factored:
+            return column_by_column(solve) if system.has_columns else solve
+
         def solve(force: Array, target: Array) -> Solution:
-            solution = direct(force, target)
+            solution = each(direct)(force, target)
             # failed worlds need no iteration: they must not make the whole batch iterate
             settled = independent | failed(solution.status)
             return jax.lax.cond(
                 everywhere(settled),
                 lambda: solution,
-                lambda: where_tree(settled, solution, self._iterated(system)(force, target)),
+                lambda: where_tree(settled, solution, each(self._iterated(system))(force, target)),
             )
 
         return solve
@@ -139,6 +142,34 @@ class RankSafe(checks.Checked, Solver):
             return solution._replace(status=first(solution.status, code))
 
         return solve
+
+
+def column_by_column(solve: Factored) -> Factored:
+    """Returns a solver of many right-hand sides that loops over them.
+
+    The program then contains the solver once, for a single right-hand side.
+
+    Args:
+        solve: solver of f, (n_v, k, …), and b, (n_c, k, …), for k right-hand sides.
+    """
+
+    def solve_each(force: Array, target: Array) -> Solution:
+        if force.shape[1] == target.shape[1] == 1:
+            return solve(force, target)
+
+        def column(_: None, right: tuple[Array, Array]) -> tuple[None, Solution]:
+            a, λ, code = solve(*(x[:, None] for x in right))
+            return None, Solution(a[:, 0], λ[:, 0], code[0])
+
+        count = max(force.shape[1], target.shape[1])
+        forces, targets = (
+            jnp.moveaxis(jnp.broadcast_to(x, (len(x), count, *x.shape[2:])), 1, 0)
+            for x in (force, target)
+        )
+        a, λ, code = jax.lax.scan(column, None, (forces, targets))[1]
+        return Solution(jnp.moveaxis(a, 0, 1), jnp.moveaxis(λ, 0, 1), code)
+
+    return solve_each
 
 
 def proximal(

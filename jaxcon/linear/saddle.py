@@ -122,6 +122,8 @@ class Saddle:
             independent, as in a tree of joints.
         layout: an object with the `names` of the constraints and their `rows(name)`, for solvers
             that treat constraints differently; None if rows have no names.
+        has_columns: True if f and b have an axis of right-hand sides after their first axis; see
+            `add_rhs_axis`.
     """
 
     mass: Mass
@@ -132,6 +134,7 @@ class Saddle:
     noise: Any = None
     loops: bool = static(default=True)
     layout: Any = static(default=None)
+    has_columns: bool = static(default=False)
 
 
 @exportable

@@ -48,7 +48,7 @@ class Cpu:
 
     max_length = 800_000
     max_arrays = 10_000
-    max_places = 24
+    max_places = 64
     max_local = 16_384
 
     def text(

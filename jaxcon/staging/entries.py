@@ -454,7 +454,8 @@ class Evaluation:
         if not 0 < length <= MAX_ROUNDS:
             raise UnsupportedError(f"a loop of {length} rounds over the rows of an array")
         same = not any(x is not None for x in rows) and not places and not _counts(body, constants)
-        limit = MAX_ITERATED if same else MAX_UNROLLED_HELD if held or spills else MAX_UNROLLED
+        limit = MAX_UNROLLED_HELD if held and not spills else MAX_UNROLLED
+        limit = MAX_ITERATED if same else limit
         kinds = [x.aval for x in body.closed.jaxpr.invars[constants + carries :]]
         results: list[list[Entries]] = []
 
