@@ -351,7 +351,6 @@ REFUSED = {
         model(HINGE.format("", ""), TENDON.format('frictionloss="1"')),
         "tendons 't'",
     ),
-    "gravcomp": (model(f'<body name="b" gravcomp="1"><joint/>{BODY}</body>'), "gravcomp of 'b'"),
 }
 
 
@@ -406,6 +405,14 @@ UNSUPPORTED = {
     "'j', 'k'\\] of body 'b' pass each other": model(
         f'<body name="b"><joint name="j" axis="1 0 0"/>'
         f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
+    ),
+    "actuatorgravcomp of joint 'j' beside": model(
+        f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BODY}'
+        "</body>",
+        '<actuator><motor joint="j"/></actuator>',
+    ),
+    "actuatorgravcomp of joint 'j' in a model": model(
+        f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true"/>{BODY}</body>'
     ),
     "gimbal lock": model(
         '<body><joint axis="0 0 1"/><joint axis="1 0 0"/><joint axis="0 0 1"/>' + BODY + "</body>"

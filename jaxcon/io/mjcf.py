@@ -23,7 +23,7 @@ from jaxcon.io.equalities import equalities
 from jaxcon.io.joints import Coordinate, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Tree
-from jaxcon.io.passive import passive
+from jaxcon.io.passive import gravity_compensation, passive
 from jaxcon.io.refusals import left_out, refuse
 from jaxcon.methods.method import Method
 from jaxcon.system.body_system import BodySystem
@@ -202,6 +202,9 @@ def from_mjcf(
     constraints are rigid, like joints; `solref` and `solimp` are not used. The integrator and the
     step size are not imported; `timestep` is the step size in the model.
 
+    The attribute gravcomp becomes a constant `jc.forces.Force`. It does not follow later changes of
+    mass or gravity.
+
     Features without effect on the motion (sites, cameras, sensors) are dropped. Unsupported
     features with an effect raise an error that names them.
 
@@ -306,6 +309,8 @@ def _add_elements(
             if count and at is not None and joint.kind == "hinge":
                 label = compiled.name("joint", joint.id)
                 scene.add(TurnCounter(names.take(f"{label} turns", "turns"), *at))
+    for element in gravity_compensation(compiled, links, names):
+        scene.add(element)
     for element in contacts(compiled, links, names):
         scene.add(element)
     return coordinates

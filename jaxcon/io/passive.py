@@ -1,4 +1,7 @@
-"""Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints."""
+"""Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints.
+
+Gravity compensation of bodies is imported here, too.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +16,10 @@ from jaxcon.constraints.pairs import Twist
 from jaxcon.contact.limits import JointFriction, Limit
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
-from jaxcon.io.links import Link, LinkJoint
+from jaxcon.io.links import Link, LinkJoint, scene_body
 from jaxcon.system.actuators import JointDamper, JointSpring
+from jaxcon.system.forces import Force
+from jaxcon.system.layout import WORLD
 
 Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Compound | Twist
 """A scene element: a passive element, or a joint without constraint rows.
@@ -54,6 +59,26 @@ def passive(
         yield from elements
         for freedom in coordinates:
             yield from _along(f"{label} {freedom.name}", freedom, numbers, 0.0, names)
+
+
+def gravity_compensation(
+    compiled: Compiled, links: tuple[Link, ...], names: Names
+) -> Iterator[Force]:
+    """Yields the force −c m g at the center of mass of each body with gravity compensation c.
+
+    m is the mass of the body and g the gravitational acceleration. MuJoCo applies no compensation
+    if both springs and dampers are disabled.
+    """
+    m = compiled.model
+    passive = not (compiled.disabled("spring") and compiled.disabled("damper"))
+    if compiled.disabled("gravity", "gravcomp") or not passive:
+        return
+    for body in map(int, np.flatnonzero(m.body_gravcomp)):
+        link = scene_body(compiled, links, body)
+        if link != WORLD:
+            name = names.take(f"{compiled.name('body', body)} gravcomp", "force")
+            force = -m.body_gravcomp[body] * m.body_mass[body] * m.opt.gravity
+            yield Force(name, link, force, compiled.data.xipos[body])
 
 
 def _along(

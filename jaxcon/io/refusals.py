@@ -60,24 +60,18 @@ def fluid(compiled: Compiled) -> list[str]:
     return [f for f in ("density", "viscosity") if getattr(options, f)]
 
 
-def gravity_compensation(compiled: Compiled) -> list[str]:
-    """Returns the names of all bodies with gravity compensation."""
-    return _named(compiled, "body", compiled.model.body_gravcomp)
-
-
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
     "torsion": ("the torsional and rolling friction of", torsion),
     "ball_limit": ("the limits of", ball_limits),
     "tendon": ("the tendons", tendons),
     "fluid": ("the option", fluid),
-    "gravcomp": ("the gravcomp of", gravity_compensation),
 }
 """The unsupported features that `ignore` may leave out.
 
 Each entry has a description and a function that returns the names of the objects with the feature.
 """
-IGNORABLE = ("contact", "self_contact", "limit", "friction", *REFUSED)
+IGNORABLE = ("contact", "self_contact", "limit", "friction", "gravcomp", *REFUSED)
 
 
 def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
@@ -128,6 +122,11 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
         yield "the flag actuation='disable' of a model with actuators"
     if m.opt.disableactuator:
         yield "the option actuatorgroupdisable"
+    if m.body_gravcomp.any() and not compiled.disabled("gravcomp"):
+        for name in _named(compiled, "joint", m.jnt_actgravcomp * m.jnt_actfrclimited):
+            yield f"actuatorgravcomp of joint '{name}' beside an actuatorfrcrange"
+        for name in _named(compiled, "joint", m.jnt_actgravcomp * (m.nu == 0)):
+            yield f"actuatorgravcomp of joint '{name}' in a model without actuators"
     yield from _unsupported_contacts(compiled)
 
 
