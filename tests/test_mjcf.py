@@ -339,10 +339,6 @@ REFUSED = {
         model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
-    "torsion": (
-        model(HINGE.format("", GEOM.format("g", 'condim="4"')) + GEOM.format("floor", "")),
-        "torsional and rolling friction of 'floor and g'",
-    ),
     "ball_limit": (model(BALL.format('range="0 1"')), "limits of 'j'"),
     "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
     "tendon": (model(HINGE.format("", ""), TENDON.format('stiffness="1"')), "tendons 't'"),
@@ -393,6 +389,10 @@ UNSUPPORTED = {
         HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
         '<contact><pair geom1="floor" geom2="g" friction="1 0.5"/></contact>',
     ),
+    "friction that depends on the direction, of floor and g \\(sphere": model(
+        HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
+        '<contact><pair geom1="floor" geom2="g" condim="6" friction="1 1 0 1 2"/></contact>',
+    ),
     "equality 'e' is of type 'tendon'": model(
         HINGE.format("", ""),
         '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
@@ -407,8 +407,8 @@ UNSUPPORTED = {
         f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
     ),
     "actuatorgravcomp of joint 'j' beside": model(
-        f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>{BODY}'
-        "</body>",
+        '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
+        f"{BODY}</body>",
         '<actuator><motor joint="j"/></actuator>',
     ),
     "actuatorgravcomp of joint 'j' in a model": model(

@@ -3,8 +3,6 @@
 import sys
 from pathlib import Path
 
-import jax.numpy as jnp
-import numpy as np
 import pytest
 
 import jaxcon as jc
@@ -30,8 +28,8 @@ def model(bodies, rest="", options=""):
 COMPENSATED = (
     f'<body gravcomp="0.7"><joint name="turn" axis="0 1 0"/>{BODY}'
     f'<body name="welded" pos="0.1 0.2 0" gravcomp="-0.4">{SMALL}</body>'
-    f'<body pos="0 0 1" gravcomp="1"><joint name="out" axis="1 0 0" actuatorgravcomp="true"/>{SMALL}'
-    "</body></body>"
+    '<body pos="0 0 1" gravcomp="1"><joint name="out" axis="1 0 0" actuatorgravcomp="true"/>'
+    f"{SMALL}</body></body>"
 )
 
 

@@ -215,9 +215,12 @@ def from_mjcf(
 
     Limits and contacts are hard and inelastic; `solref` and `solimp` are not used. They act at the
     distance `margin`, where MuJoCo's soft limits and contacts begin to act. Friction is Coulomb
-    friction with the sliding coefficient. Read reactions as `info.reactions["knee limit"]`,
-    `["knee friction"]` or `["floor and foot"]`. If a pair has several contact points, their names
-    are numbered.
+    friction with the sliding coefficient. Torsional and rolling friction (condim 4 and 6) become
+    `spinning` and `rolling` of the contact. Sliding, spinning and rolling have one bound each; in
+    MuJoCo they share one cone.
+
+    Read reactions as `info.reactions["knee limit"]`, `["knee friction"]` or `["floor and foot"]`.
+    If a pair has several contact points, their names are numbered.
 
     Every pair of geoms adds rows to every step, whether it touches or not. In many models, most
     pairs are between the robot's own limbs; `ignore=("self_contact",)` keeps only contacts with the

@@ -28,12 +28,6 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
-def torsion(compiled: Compiled) -> list[str]:
-    """Returns the names of all pairs of geoms with torsional or rolling friction."""
-    listed = [p for p in pairs.pairs(compiled) if p.condim > 3 and pairs.supported(compiled, p)]
-    return [pairs.label(compiled, p) for p in listed]
-
-
 def ball_limits(compiled: Compiled) -> list[str]:
     """Returns the names of all ball joints with limits."""
     m = compiled.model
@@ -62,7 +56,6 @@ def fluid(compiled: Compiled) -> list[str]:
 
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
-    "torsion": ("the torsional and rolling friction of", torsion),
     "ball_limit": ("the limits of", ball_limits),
     "tendon": ("the tendons", tendons),
     "fluid": ("the option", fluid),
@@ -71,7 +64,7 @@ REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
 
 Each entry has a description and a function that returns the names of the objects with the feature.
 """
-IGNORABLE = ("contact", "self_contact", "limit", "friction", "gravcomp", *REFUSED)
+IGNORABLE = ("contact", "self_contact", "torsion", "limit", "friction", "gravcomp", *REFUSED)
 
 
 def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
@@ -144,7 +137,10 @@ def _unsupported_contacts(compiled: Compiled) -> Iterable[str]:
     if contacts and np.any(getattr(m, "pair_adhesion", 0.0)):
         yield "adhesion of a pair"
     for pair in contacts:
-        if pair.condim > 1 and pair.friction[0] != pair.friction[1]:
+        sliding, rolling = pair.friction[:2], pair.friction[3:]
+        directed = pair.condim > 1 and sliding[0] != sliding[1]
+        rolls = pair.condim == 6 and "torsion" not in compiled.ignored
+        if directed or (rolls and rolling[0] != rolling[1]):
             yield f"friction that depends on the direction, of {_described(compiled, pair)},"
 
 
