@@ -185,7 +185,7 @@ def test_torsional_and_rolling_friction_are_those_of_mujoco():
 
 @pytest.mark.parametrize("qvel", [(0.3, 0, 0, 0, 3.0, 0), (0, 0, 0, 0, 0, 8.0)])
 def test_a_ball_rolls_and_spins_as_in_mujoco(qvel):
-    """The motion is compared up to 2 %: MuJoCo's friction is soft, and its bounds share a cone."""
+    """The motion is compared up to 3 %: MuJoCo's friction is soft, and its bounds share a cone."""
     m = model(
         '<geom type="plane" size="1 1 1" condim="1" friction="0 0 0"/><body pos="0 0 0.1">'
         '<freejoint/><geom size="0.1" condim="6" friction="1 0.02 0.02"/></body>',
@@ -200,7 +200,7 @@ def test_a_ball_rolls_and_spins_as_in_mujoco(qvel):
     change = data.qvel - qvel
     assert max(abs(change)) > 0.5
     got = np.asarray(read.qvel(end)) - qvel
-    np.testing.assert_allclose(got, change, atol=0.02 * max(abs(change)))
+    np.testing.assert_allclose(got, change, atol=0.03 * max(abs(change)))
 
 
 JOINTS = """
