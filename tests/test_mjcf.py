@@ -331,7 +331,6 @@ def test_equalities_that_are_not_active_are_left_out():
 
 
 HINGE = f'<body name="b"><joint name="j" {{}}/>{BODY}{{}}</body>'
-BALL = f'<body name="b"><joint name="j" type="ball" {{}}/>{BODY}</body>'
 GEOM = '<geom name="{}" size="0.1 0.1 0.1" {}/>'
 TENDON = '<tendon><fixed name="t" {}><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
@@ -339,7 +338,6 @@ REFUSED = {
         model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
-    "ball_limit": (model(BALL.format('range="0 1"')), "limits of 'j'"),
     "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
     "tendon": (model(HINGE.format("", ""), TENDON.format('stiffness="1"')), "tendons 't'"),
     "tendon that ends": (model(HINGE.format("", ""), TENDON.format('range="0 1"')), "tendons 't'"),
@@ -367,8 +365,23 @@ def acting(actuator):
 
 UNSUPPORTED = {
     "mocap body": model(f'<body mocap="true"/>{HINGE.format("", "")}'),
-    "trntype 'site'": model(
-        HINGE.format("", '<site name="s"/>'), '<actuator><motor name="m" site="s"/></actuator>'
+    "trntype 'body'": model(
+        HINGE.format("", ""), '<actuator><adhesion name="m" body="b" ctrlrange="0 1"/></actuator>'
+    ),
+    "site that cannot move in the world": model(
+        HINGE.format("", "") + '<site name="s"/>', '<actuator><motor site="s"/></actuator>'
+    ),
+    "site that cannot move in the link": model(
+        HINGE.format("", '<site name="s"/><site name="t"/>'),
+        '<actuator><motor site="s" refsite="t"/></actuator>',
+    ),
+    "reference site in the body 'b', which does not carry": model(
+        HINGE.format("", '<site name="s"/>') + f'<body><joint/>{BODY}<site name="t"/></body>',
+        '<actuator><motor site="t" refsite="s"/></actuator>',
+    ),
+    "turned by 0.4 rad": model(
+        HINGE.format("", '<site name="s" axisangle="0 0 1 0.4"/>') + '<site name="t"/>',
+        '<actuator><position site="s" refsite="t" gear="0 0 0 0 0 1" kp="1"/></actuator>',
     ),
     "dyntype 'filter'": acting('<general joint="turn" dyntype="filter" dynprm="1"/>'),
     "biastype 'muscle'": acting(

@@ -1,4 +1,4 @@
-"""Import of MuJoCo's joint actuators; each is a control channel, in the order of MuJoCo's ctrl."""
+"""Import of MuJoCo's actuators; each is a control channel, in the order of MuJoCo's ctrl."""
 
 from __future__ import annotations
 
@@ -8,23 +8,25 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.measures import Thrust
 from jaxcon.constraints.pairs import Twist
 from jaxcon.core import checks
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
-from jaxcon.io.links import Link, LinkJoint
+from jaxcon.io.links import Link, LinkJoint, scene_body
 from jaxcon.system.actuators import AffineActuator, Motor
+from jaxcon.system.layout import WORLD
 
 
 class Transmission(NamedTuple):
-    """The transmission of an actuator: the joint coordinate on which it acts, and its gear ratio.
+    """The transmission of an actuator: the coordinate on which it acts, and its gear ratio.
 
     Attributes:
-        at: the joint coordinate θ = qpos − reference.
+        at: the coordinate θ, zero at assembly.
         gear: the gear ratio g.
-        reference: the value of qpos at assembly.
-        measured: True if the actuator length is g (θ + reference); False for free joints, whose
-            actuator length is zero.
+        reference: MuJoCo's value of the coordinate at assembly, such as qpos.
+        measured: True if the actuator length is g (θ + reference); False for free joints, and for
+            sites without a reference site, whose actuator length is zero.
     """
 
     at: Coordinate
@@ -34,7 +36,7 @@ class Transmission(NamedTuple):
 
 
 LAWS = (
-    ("trntype", "mjtTrn", ("joint", "jointinparent")),
+    ("trntype", "mjtTrn", ("joint", "jointinparent", "site")),
     ("dyntype", "mjtDyn", ("none",)),
     ("gaintype", "mjtGain", ("fixed", "affine")),
     ("biastype", "mjtBias", ("none", "affine")),
@@ -44,7 +46,10 @@ LAWS = (
 Each entry has MuJoCo's field, its enumeration, and the names of the supported values.
 """
 
-Element: TypeAlias = Motor | AffineActuator | Compound | Twist
+ALIGNED = 1e-9
+"""The largest angle [rad] between a site and its reference site that count as aligned."""
+
+Element: TypeAlias = Motor | AffineActuator | Compound | Twist | Thrust
 """A scene element: an actuator, or a joint without constraint rows.
 
 Such a joint defines the coordinate on which an actuator acts.
@@ -69,18 +74,38 @@ def actuators(
         NotImplementedError: an actuator is not supported.
     """
     m = compiled.model
-    joints = {joint.id: (link, joint) for link in links for joint in link.joints}
-    for i in range(m.nu):
+    for i in range(len(m.actuator_trntype)):
         _check(compiled, i)
-        link, joint = joints[int(m.actuator_trnid[i, 0])]
         name = names.take(compiled.name("actuator", i), "actuator")
-        if joint.id in coordinates:
-            gear, reference = float(m.actuator_gear[i, 0]), float(m.qpos0[joint.q])
-            transmission = Transmission(coordinates[joint.id], gear, reference)
+        if compiled.choice("mjtTrn", m.actuator_trntype[i]) == "site":
+            element, transmission = _at_site(compiled, i, links, names)
         else:
-            element, transmission = _vector(compiled, i, link, joint, names)
+            element, transmission = _on_joint(compiled, i, links, coordinates, names)
+        if element is not None:
             yield element
         yield _law(compiled, i, name, transmission)
+
+
+def _on_joint(
+    compiled: Compiled,
+    i: int,
+    links: tuple[Link, ...],
+    coordinates: dict[int, Coordinate],
+    names: Names,
+) -> tuple[Compound | Twist | None, Transmission]:
+    """Returns the transmission of an actuator on a joint.
+
+    Returns:
+        A joint without constraint rows for actuators on ball and free joints, otherwise None; and
+        the transmission.
+    """
+    m = compiled.model
+    joints = {joint.id: (link, joint) for link in links for joint in link.joints}
+    link, joint = joints[int(m.actuator_trnid[i, 0])]
+    if joint.id not in coordinates:
+        return _vector(compiled, i, link, joint, names)
+    gear, reference = float(m.actuator_gear[i, 0]), float(m.qpos0[joint.q])
+    return None, Transmission(coordinates[joint.id], gear, reference)
 
 
 def _check(compiled: Compiled, i: int) -> None:
@@ -135,9 +160,9 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     """
     m, joint = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
-    if not m.jnt_actfrclimited[joint] or not gear:
-        return of_actuator
     kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
+    if kinds[i] == "site" or not m.jnt_actfrclimited[joint] or not gear:
+        return of_actuator
     on_joint = np.isin(kinds, ("joint", "jointinparent")) & (m.actuator_trnid[:, 0] == joint)
     if sum(on_joint) > 1:
         raise NotImplementedError(
@@ -183,3 +208,75 @@ def _vector(
     twist = turning(link, world, names.take(f"{label} twist", "twist"), backward=in_parent)
     at, sign = Coordinate(twist.name, "twist"), -1 if in_parent else 1
     return twist, Transmission(at, sign * size, measured=joint.kind == "ball")
+
+
+def _at_site(
+    compiled: Compiled, i: int, links: tuple[Link, ...], names: Names
+) -> tuple[Compound | Twist | Thrust, Transmission]:
+    """Builds the transmission of an actuator at a site.
+
+    Without a reference site, the gear is a force and a torque in the frame of the site. With a
+    reference site, the gear is a force or a torque in its frame, and the actuator length is the
+    position of the site, or its rotation vector, in this frame.
+
+    Returns:
+        A joint without constraint rows, and the transmission on its coordinate.
+
+    Raises:
+        NotImplementedError: the site cannot move relative to its reference, the reference site is
+            in no link that carries the site, the gear has both a force and a torque, or a torque
+            depends on the rotation between sites that are not aligned at the reference pose.
+    """
+    m, data = compiled.model, compiled.data
+    label, (site, reference) = compiled.name("actuator", i), map(int, m.actuator_trnid[i])
+    owner, gear = f"from_mjcf: actuator '{label}'", m.actuator_gear[i]
+    body = scene_body(compiled, links, int(m.site_bodyid[site]))
+    point = data.site_xpos[site]
+    above = WORLD if reference < 0 else scene_body(compiled, links, int(m.site_bodyid[reference]))
+    if body == above:
+        what = "world" if reference < 0 else "link of its reference site"
+        raise NotImplementedError(f"{owner} is at a site that cannot move in the {what}.")
+    frame = data.site_xmat[site if reference < 0 else reference].reshape(3, 3)
+    force, torque = frame @ gear[:3], frame @ gear[3:]
+    if reference < 0:
+        thrust = Thrust(names.take(f"{label} thrust", "thrust"), WORLD, body, point, force, torque)
+        return thrust, Transmission(Coordinate(thrust.name, "thrust"), 1.0, measured=False)
+    parents = {link.name: link.above for link in links}
+    carriers = [parents[body]]
+    while carriers[-1] != WORLD:
+        carriers.append(parents[carriers[-1]])
+    if above not in carriers:
+        raise NotImplementedError(
+            f"{owner} has a reference site in the body '{above}', which does not carry the site;"
+            " put the reference site into one of the bodies that do, or into the world."
+        )
+    if force.any() and torque.any():
+        raise NotImplementedError(
+            f"{owner} has a reference site and a gear with a force and a torque,"
+            f" {checks.numerals(gear)}; give each an actuator of its own."
+        )
+    if torque.any():
+        size = float(np.linalg.norm(torque))
+        turned = np.zeros(3)
+        turns = [np.zeros(4) for _ in range(2)]
+        for turn, end in zip(turns, (site, reference), strict=True):
+            compiled.mujoco.mju_mat2Quat(turn, data.site_xmat[end])
+        compiled.mujoco.mju_subQuat(turned, *turns)
+        if np.linalg.norm(turned) > ALIGNED and (
+            m.actuator_gainprm[i, 1] or m.actuator_biasprm[i, 1]
+        ):
+            raise NotImplementedError(
+                f"{owner} has a torque that depends on the rotation from its reference site to its"
+                f" site, which are turned by {np.linalg.norm(turned):.3g} rad in the reference"
+                " pose; align them there."
+            )
+        name = names.take(f"{label} twist", "twist")
+        twist = Twist(name, body, above, axis=torque / size)  # the axis turns with `above`
+        return twist, Transmission(Coordinate(name, "twist"), -size)
+    size = float(np.linalg.norm(force))
+    axes = np.linalg.svd(force[None])[2] if size else np.eye(3)
+    axes[0] = force / size if size else axes[0]
+    name = names.take(f"{label} push", "push")
+    push = Compound(name, above, body, point, slides=(*axes,), ball=True)
+    distance = float(axes[0] @ (point - data.site_xpos[reference]))
+    return push, Transmission(Coordinate(name, "travel_1"), size, distance)

@@ -208,7 +208,11 @@ def from_mjcf(
     Features without effect on the motion (sites, cameras, sensors) are dropped. Unsupported
     features with an effect raise an error that names them.
 
-    Ranges of hinges and slides become `jc.contacts.Limit`. The attribute frictionloss becomes
+    Actuators act on joints, or at sites: without a reference site as a `jc.joints.Thrust`, which
+    adds a force and a torque that turn with the site.
+
+    Ranges of hinges and slides become `jc.contacts.Limit`. Ranges of ball joints limit a
+    `jc.joints.RotationAngle`. The attribute frictionloss becomes
     `jc.contacts.JointFriction`. Pairs of geoms become contacts: spheres, capsules and boxes on
     planes, and spheres and capsules with each other. A capsule touches a plane at its ends, and a
     box at its corners.

@@ -12,6 +12,7 @@ import numpy as np
 
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.measures import RotationAngle
 from jaxcon.constraints.pairs import Twist
 from jaxcon.contact.limits import JointFriction, Limit
 from jaxcon.io.compiled import Compiled, Names
@@ -21,7 +22,8 @@ from jaxcon.system.actuators import JointDamper, JointSpring
 from jaxcon.system.forces import Force
 from jaxcon.system.layout import WORLD
 
-Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Compound | Twist
+Joint: TypeAlias = Compound | Twist | RotationAngle
+Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Joint
 """A scene element: a passive element, or a joint without constraint rows.
 
 Such a joint defines the coordinate on which passive elements act.
@@ -54,7 +56,10 @@ def passive(
         rest = m.qpos_spring[joint.q] - m.qpos0[joint.q]
         yield from _along(label, at, numbers, rest, names)
         yield from _limit(compiled, joint, at, names)
-    elif any(numbers.values()):
+        return
+    if joint.kind == "ball":
+        yield from _ball_limit(compiled, link, joint, names)
+    if any(numbers.values()):
         elements, coordinates = _freedoms(compiled, link, joint, names)
         yield from elements
         for freedom in coordinates:
@@ -120,6 +125,19 @@ def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -
     lower, upper = m.jnt_range[joint.id] - m.qpos0[joint.q] + inward
     name = names.take(f"{compiled.name('joint', joint.id)} limit", "limit")
     yield Limit(name, at.joint, lower, upper, at.name)
+
+
+def _ball_limit(
+    compiled: Compiled, link: Link, joint: LinkJoint, names: Names
+) -> Iterator[RotationAngle | Limit]:
+    """Yields the limit of the rotation angle of a ball joint, if it has one, and its coordinate."""
+    m, label = compiled.model, compiled.name("joint", joint.id)
+    if compiled.disabled("limit", "ball_limit", "constraint") or not m.jnt_limited[joint.id]:
+        return
+    name = names.take(f"{label} angle", "angle")
+    yield RotationAngle(name, link.above, link.name, compiled.data.xanchor[joint.id])
+    upper = m.jnt_range[joint.id].max() - m.jnt_margin[joint.id]
+    yield Limit(names.take(f"{label} limit", "limit"), name, upper=upper)
 
 
 def _freedoms(

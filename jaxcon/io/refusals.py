@@ -28,15 +28,6 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
-def ball_limits(compiled: Compiled) -> list[str]:
-    """Returns the names of all ball joints with limits."""
-    m = compiled.model
-    if compiled.disabled("limit", "constraint"):
-        return []
-    balls = m.jnt_type == int(compiled.mujoco.mjtJoint.mjJNT_BALL)
-    return _named(compiled, "joint", m.jnt_limited.astype(bool) & balls)
-
-
 def tendons(compiled: Compiled) -> list[str]:
     """Returns the names of all tendons with forces or limits; other tendons are only sensors."""
     m = compiled.model
@@ -56,7 +47,6 @@ def fluid(compiled: Compiled) -> list[str]:
 
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
-    "ball_limit": ("the limits of", ball_limits),
     "tendon": ("the tendons", tendons),
     "fluid": ("the option", fluid),
 }
@@ -64,7 +54,11 @@ REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
 
 Each entry has a description and a function that returns the names of the objects with the feature.
 """
-IGNORABLE = ("contact", "self_contact", "torsion", "limit", "friction", "gravcomp", *REFUSED)
+IGNORABLE = (
+    *("contact", "self_contact", "torsion", "limit", "ball_limit", "friction", "gravcomp"),
+    *REFUSED,
+)
+"""The values that the argument `ignore` of `from_mjcf` may have."""
 
 
 def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
