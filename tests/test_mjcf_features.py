@@ -106,3 +106,208 @@ def test_the_rotation_of_a_ball_joint_is_limited():
         np.testing.assert_allclose(gap[i], data.efc_pos - data.efc_margin, atol=1e-9)
         np.testing.assert_allclose(rate[i], data.efc_vel, atol=1e-9)
     assert not jc.from_mjcf(m, ignore=("ball_limit",)).system.bounds
+
+
+SENSED = (
+    '<geom name="floor" type="plane" size="2 2 1" pos="0 0 -0.4"/>'
+    '<site name="ground" pos="0.2 -0.1 0.3" euler="0.1 0.7 0.3"/>'
+    f'<body name="base"><freejoint/>{BODY}{SITE.format("base")}'
+    '<geom name="hull" type="capsule" size="0.1 0.2" pos="0.1 0 0.1" euler="0.4 0.3 0.1"/>'
+    f'<body name="arm" pos="0 0 1"><joint name="ball" type="ball"/>{SMALL}'
+    f'<body name="wrist" pos="0.1 0.2 0" euler="0.3 0.5 0.1">{SMALL}{SITE.format("wrist")}'
+    '<geom name="knob" size="0.2" pos="0.1 0 0.1"/>'
+    '<body name="hand" pos="0.1 0.1 0"><joint name="turn" axis="1 0.2 0" ref="0.3"'
+    ' range="-0.2 0.4" stiffness="2" damping="0.3" armature="0.1"/>'
+    f"{BODY}{SITE.format('hand')}"
+    '<camera name="eye" pos="0.1 0.2 0.3" euler="0.5 0.1 0.2"/></body></body></body></body>'
+    f'<body pos="1 0 0"><joint name="slide" type="slide" axis="0 1 0.3"/>{SMALL}</body>'
+)
+SENSORS = """<sensor>
+<jointpos joint="turn"/><jointvel joint="slide"/><ballquat joint="ball"/><ballangvel joint="ball"/>
+<jointactuatorfrc joint="turn"/><jointactuatorfrc joint="slide"/>
+<actuatorpos actuator="servo"/><actuatorvel actuator="push"/><actuatorfrc actuator="servo"/>
+<actuatorfrc actuator="push"/><actuatorpos actuator="jet"/><actuatorvel actuator="jet"/>
+<framepos objtype="site" objname="hand"/>
+<framepos objtype="body" objname="wrist" reftype="site" refname="base"/>
+<framequat objtype="xbody" objname="wrist"/>
+<framequat objtype="site" objname="hand" reftype="body" refname="arm"/>
+<framexaxis objtype="geom" objname="hull"/>
+<frameyaxis objtype="site" objname="hand" reftype="site" refname="ground"/>
+<framezaxis objtype="camera" objname="eye"/>
+<framelinvel objtype="site" objname="hand"/><frameangvel objtype="body" objname="wrist"/>
+<framelinvel objtype="site" objname="hand" reftype="xbody" refname="base"/>
+<frameangvel objtype="site" objname="hand" reftype="xbody" refname="base"/>
+<framelinacc objtype="site" objname="hand"/><frameangacc objtype="body" objname="wrist"/>
+<framelinacc objtype="site" objname="ground"/>
+<gyro site="hand"/><velocimeter site="wrist"/><accelerometer site="hand"/>
+<accelerometer site="base" cutoff="5"/><magnetometer site="hand"/>
+<force site="hand"/><torque site="hand"/><force site="wrist"/><torque site="wrist"/>
+<force site="base"/>
+<subtreecom body="base"/><subtreecom body="wrist"/><subtreelinvel body="arm"/>
+<subtreeangmom body="base"/><subtreeangmom body="wrist"/>
+<clock/><e_potential/><e_kinetic/></sensor>"""
+DRIVEN = """<actuator><position name="servo" joint="turn" kp="3" kv="0.2" gear="2"/>
+<general name="push" joint="slide" gainprm="4" gear="3"/>
+<motor name="jet" site="hand" gear="1 2 3 1 0 2"/></actuator>"""
+
+
+def test_sensors_are_those_of_mujoco():
+    m = model(SENSED, DRIVEN + SENSORS)
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    states = agreement.random_states(m, 100)
+    method = agreement.EXACT
+
+    def readings(qpos, qvel, ctrl):
+        state = read.state(qpos, qvel, 0.3)
+        info = jc.forward_dynamics(read.system, state, ctrl, method, 1e-3)
+        return read.sensors(state, info)
+
+    got = agreement.quick(jax.vmap(readings))(*map(jnp.asarray, states))
+    for i in range(100):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (x[i] for x in states)
+        data.time = 0.3
+        mujoco.mj_forward(m, data)
+        for name, where in read.sensor_slices.items():
+            expected = data.sensordata[where]
+            size = max(1, abs(expected).max())
+            np.testing.assert_allclose(got[i][where], expected, atol=AGREE * size, err_msg=name)
+
+
+LOADED = (
+    '<geom name="floor" type="plane" size="2 2 1"/><body name="upper" pos="0 0 1">'
+    f'<joint name="shoulder" type="ball"/>{BODY}<body name="lower" pos="0 0.3 -0.5">'
+    f'<joint name="elbow" axis="1 0 0"/>{BODY}<body name="foot" pos="0.1 0.1 -0.5">{SMALL}'
+    f'<geom name="sole" size="0.2"/>{SITE.format("foot")}</body>{SITE.format("knee")}'
+    "</body></body>"
+)
+
+
+def test_sensors_of_force_read_the_wrench_of_a_joint():
+    """The load on a joint less contacts and equalities below is the wrench of the joint."""
+    rest = (
+        '<equality><connect name="tie" body1="foot" body2="upper" anchor="0.1 0.2 0.1"/></equality>'
+        '<sensor><force site="knee"/><torque site="knee"/><touch name="step" site="foot"/></sensor>'
+    )
+    text = f"<mujoco><worldbody>{LOADED}</worldbody>{rest}</mujoco>"
+    read = jc.from_mjcf(text)
+    method = read.method()
+    qpos = jnp.array([1.0, 0.1, 0.2, 0.05, -0.7])
+    qvel = jnp.array([0.3, -0.2, 0.1, 0.4])
+    state = read.state(qpos, qvel)
+    state = jc.init(read.system, method, state.q, state.v)
+    info = jax.jit(lambda s: jc.step(read.system, method, s, None, 2e-3)[1])(state)
+    system = read.system
+    assert float(info.reactions["floor and sole"][0]) > 1
+    wrench = jc.wrench(info, "elbow", system=system)
+    data = mujoco.MjData(m := mujoco.MjModel.from_xml_string(text))
+    data.qpos[:] = read.qpos(info.state)
+    mujoco.mj_kinematics(m, data)
+    arm = data.joint("elbow").xanchor - data.site("knee").xpos
+    frame = data.site("knee").xmat.reshape(3, 3)
+    force, torque = np.split(np.asarray(wrench), 2)
+    expected = np.concatenate([frame.T @ force, frame.T @ (torque + np.cross(arm, force))])
+    found = read.sensors(state, info, names=("sensor 0", "sensor 1"))
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-8)
+
+
+TOUCHED = (
+    '<geom type="plane" size="2 2 1"/><body pos="0 0 0.1"><joint type="slide" axis="0 0 1"/>'
+    '<geom name="left" size="0.1" pos="0.3 0 0" mass="1"/>'
+    '<geom name="right" size="0.1" pos="-0.3 0 0" mass="1"/>'
+    '<site name="both" size="0.5"/>'
+    '<site name="heel" type="{}" pos="0.3 0 -0.1" size="0.1 0.1 0.1"/>'
+    '<site name="above" size="0.1" pos="0.3 0 0.2"/><site name="aside" size="0.1" pos="0.3 0.3 0"/>'
+    '<body><geom mass="2" size="0.1" contype="0" conaffinity="0" pos="0 0 1"/>'
+    '<site name="head" size="0.5"/></body></body>'
+)
+
+
+@pytest.mark.parametrize("shape", ["sphere", "capsule", "ellipsoid", "cylinder", "box"])
+def test_touch_is_that_of_mujoco(shape):
+    """At rest two balls carry a weight; a zone above a contact is met by its line of action."""
+    sites = ("both", "heel", "above", "aside", "head")
+    sensors = "".join(f'<touch name="{site}" site="{site}"/>' for site in sites)
+    body = f"<worldbody>{TOUCHED.format(shape)}</worldbody>"
+    m = mujoco.MjModel.from_xml_string(f"<mujoco>{body}<sensor>{sensors}</sensor></mujoco>")
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    info = jc.step(read.system, read.method(), read.start, None, 2e-3)[1]
+    mujoco.mj_step(m, data, 2000)
+    found = read.sensors(read.start, info)
+    assert data.sensordata[1] > 0
+    np.testing.assert_array_equal(np.asarray(found) == 0, data.sensordata == 0)
+    np.testing.assert_allclose(found, data.sensordata, rtol=1e-4)
+
+
+RANGED = (
+    f'<body><joint name="turn" axis="0 1 0" range="-0.3 0.5" margin="0.1" ref="0.2"/>{BODY}'
+    f'<body pos="0 0 1"><joint name="out" type="slide" axis="1 0 0" range="-9 9"/>{SMALL}</body>'
+    "</body>"
+)
+LIMIT_SENSORS = "".join(
+    f'<jointlimit{what} name="{what} {joint}" joint="{joint}"/>'
+    for what in ("pos", "vel", "frc")
+    for joint in ("turn", "out")
+)
+
+
+def test_sensors_of_limits():
+    """The position and rate are MuJoCo's; the force is the reaction of the limit."""
+    text = f'<mujoco><compiler angle="radian"/><worldbody>{RANGED}</worldbody>'
+    m = mujoco.MjModel.from_xml_string(f"{text}<sensor>{LIMIT_SENSORS}</sensor></mujoco>")
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    names = [f"{what} {joint}" for what in ("pos", "vel") for joint in ("turn", "out")]
+    readings = jax.jit(lambda q, v: read.sensors(read.state(q, v), names=names))
+    for angle in (-0.4, 0.0, 0.45):
+        data.qpos[:], data.qvel[:] = (angle, 0.1), (0.7, 0.2)
+        mujoco.mj_forward(m, data)
+        found = readings(jnp.asarray(data.qpos), jnp.asarray(data.qvel))
+        np.testing.assert_allclose(found, data.sensordata[:4], atol=1e-9)
+    state = read.state(jnp.array([0.45, 0.1]))
+    info = jc.forward_dynamics(read.system, state, None, read.method(), 1e-3)
+    force = read.sensors(state, info)[4:]
+    np.testing.assert_allclose(force, [info.reactions["turn limit"][0], 0], atol=1e-12)
+    assert float(force[0]) > 0
+
+
+def test_sensors_have_gradients_in_single_precision():
+    sensors = (
+        '<sensor><accelerometer site="s"/><force site="s"/><framequat objtype="site" objname="s"/>'
+        '<subtreeangmom body="arm"/><jointpos joint="turn"/></sensor>'
+    )
+    body = f'<body name="arm"><joint name="turn" axis="0 1 0"/>{BODY}{SITE.format("s")}</body>'
+    read = jc.from_mjcf(model(body, sensors), dtype=jnp.float32)
+
+    def total(qpos):
+        state = read.state(qpos)
+        info = jc.forward_dynamics(read.system, state, None, agreement.EXACT, 1e-3)
+        return jnp.sum(read.sensors(state, info))
+
+    found = agreement.quick(jax.grad(total))(jnp.array([0.3], jnp.float32))
+    assert found.dtype == jnp.float32
+    assert np.all(np.isfinite(found))
+    assert np.all(found)
+
+
+def test_errors_of_sensors_name_them():
+    sensors = (
+        '<sensor><jointpos name="angle" joint="turn"/><gyro name="spin" site="s"/>'
+        '<accelerometer name="felt" site="s"/><rangefinder name="ahead" site="s"/>'
+        '<actuatorfrc name="pull" actuator="m"/></sensor>'
+    )
+    body = f'<body><joint name="turn" axis="0 1 0"/>{BODY}<site name="s"/></body>'
+    m = model(body, '<actuator><motor name="m" joint="turn"/></actuator>' + sensors)
+    read = jc.from_mjcf(m)
+    state = read.state(jnp.array([0.3]), jnp.array([2.0]))
+    found = read.sensors(state, names=("spin", "angle"))
+    np.testing.assert_allclose(found, [0, 2, 0, 0.3], atol=1e-12)
+    assert read.sensor_slices["ahead"] == slice(7, 8)
+    for names, error, match in (
+        (None, NotImplementedError, "'ahead' of type rangefinder is not supported; read other"),
+        (("behind",), ValueError, "'behind' is unknown; known are \\['angle', 'spin'"),
+        (("felt",), ValueError, "'felt' of type accelerometer needs accelerations and"),
+        (("pull",), ValueError, "'pull' of type actuatorfrc needs the control inputs"),
+    ):
+        with pytest.raises(error, match=match):
+            read.sensors(state, names=names)
+    assert read.sensors(state, control=jnp.array([3.0]), names=("pull",)) == 3
+    assert jc.from_mjcf(model(body)).sensors(state).shape == (0,)

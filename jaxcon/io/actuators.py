@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -56,13 +55,25 @@ Such a joint defines the coordinate on which an actuator acts.
 """
 
 
+class Actuators(NamedTuple):
+    """The actuators of a model.
+
+    Attributes:
+        elements: the scene elements.
+        transmissions: the transmission of each actuator, in MuJoCo's order.
+    """
+
+    elements: list[Element]
+    transmissions: list[Transmission]
+
+
 def actuators(
     compiled: Compiled,
     links: tuple[Link, ...],
     coordinates: dict[int, Coordinate],
     names: Names,
-) -> Iterator[Element]:
-    """Yields the scene elements of all actuators of a model.
+) -> Actuators:
+    """Returns the scene elements of all actuators of a model.
 
     Args:
         compiled: the model.
@@ -73,7 +84,7 @@ def actuators(
     Raises:
         NotImplementedError: an actuator is not supported.
     """
-    m = compiled.model
+    m, found = compiled.model, Actuators([], [])
     for i in range(len(m.actuator_trntype)):
         _check(compiled, i)
         name = names.take(compiled.name("actuator", i), "actuator")
@@ -81,9 +92,10 @@ def actuators(
             element, transmission = _at_site(compiled, i, links, names)
         else:
             element, transmission = _on_joint(compiled, i, links, coordinates, names)
-        if element is not None:
-            yield element
-        yield _law(compiled, i, name, transmission)
+        found.elements.extend([] if element is None else [element])
+        found.elements.append(_law(compiled, i, name, transmission))
+        found.transmissions.append(transmission)
+    return found
 
 
 def _on_joint(

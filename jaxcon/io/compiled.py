@@ -113,10 +113,15 @@ class Names:
     """The names used in a scene, which must be unique.
 
     In MuJoCo, objects of different kinds may have equal names.
+
+    Attributes:
+        taken: the names in the scene.
+        given: the name in the scene by the wanted name and the kind of the object.
     """
 
     def __init__(self) -> None:
         self.taken = {"world", "gravity"}
+        self.given: dict[tuple[str, str], str] = {}
 
     def take(self, name: str, kind: str) -> str:
         """Reserves a unique name and returns it.
@@ -131,6 +136,7 @@ class Names:
         while free in self.taken:
             free, n = f"{name} {kind}" + f" {n}" * (n > 1), n + 1
         self.taken.add(free)
+        self.given.setdefault((name, kind), free)
         return free
 
 

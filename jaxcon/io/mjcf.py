@@ -15,17 +15,22 @@ from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.summary import listed, span, table
 from jaxcon.core.typing import Array, DType, Scalar
+from jaxcon.execution.step import SolutionAt
 from jaxcon.io import maps
-from jaxcon.io.actuators import actuators
+from jaxcon.io.actuators import Transmission, actuators
 from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
 from jaxcon.io.equalities import equalities
 from jaxcon.io.joints import Coordinate, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Tree
+from jaxcon.io.measuring import Reading
 from jaxcon.io.passive import gravity_compensation, passive
 from jaxcon.io.refusals import left_out, refuse
+from jaxcon.io.sensor_import import Importer
+from jaxcon.io.sensors import Sensors
 from jaxcon.methods.method import Method
+from jaxcon.step import StepInfo
 from jaxcon.system.body_system import BodySystem
 from jaxcon.system.coordinates import TurnCounter
 from jaxcon.system.inertial import restate
@@ -59,6 +64,7 @@ class MujocoModel:
         timestep: the step size in the model's options, () [s].
         tree: the kinematic tree in MuJoCo's coordinates.
         keys: time, qpos, qvel and ctrl of each keyframe.
+        readings: the sensors; `sensors` reads them.
         joints: for each hinge and slide, its name in MuJoCo, and its coordinate in the system.
         keyframes: the names of the keyframes; "key 0" and so on for keyframes without a name.
     """
@@ -68,6 +74,7 @@ class MujocoModel:
     timestep: Array
     tree: Tree
     keys: tuple[dict[str, Array], ...]
+    readings: Sensors
     joints: tuple[tuple[str, Coordinate], ...] = static()
     keyframes: tuple[str, ...] = static()
 
@@ -174,6 +181,48 @@ class MujocoModel:
         slopes = self.system.kinematics(state.q, state.v), acceleration
         return jax.jvp(qvel, (state.q, state.v), slopes)[1]
 
+    @property
+    def sensor_slices(self) -> dict[str, slice]:
+        """The slice of each sensor in MuJoCo's sensordata, by name."""
+        return {x.name: slice(x.start, x.start + x.size) for x in self.readings.entries}
+
+    def sensors(
+        self,
+        state: State,
+        info: StepInfo | SolutionAt | None = None,
+        control: Array | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Array:
+        """Reads the sensors, (nsensordata,), as MuJoCo's sensordata; a pure function.
+
+        Accelerometers and sensors of force, torque and touch read the `info`, at its state, which
+        is the start of the step. All other sensors read `state`. For readings of one instant, as in
+        MuJoCo, pass the state before the step, or `jc.forward_dynamics` of the state. Cutoffs are
+        applied; noise is not added.
+
+        Args:
+            state: the state of one world.
+            info: the info of a step, or the result of `jc.forward_dynamics`. Models without these
+                sensors need none.
+            control: MuJoCo's ctrl, (nu,); by default the control of the info.
+            names: the sensors to read, in the order of the result; by default all. Sensors without
+                a name are called "sensor 0" and so on.
+
+        Raises:
+            ValueError: a name is unknown, or a sensor needs an info or the control.
+            NotImplementedError: a sensor is not supported; the message names it.
+        """
+        chosen = self.readings.chosen(names)
+        control = info.control if control is None and info is not None else control
+        self.readings.check(chosen, info, control, self.system.layout.n_u)
+        if control is not None:
+            given = state.q.dtype, (self.system.layout.n_u,)
+            control = checks.real("sensors", "control", control, *given)
+        model = self.system, self.tree, self.readings.parts
+        here = Reading(*model, state, None, control)
+        start = here if info is None else Reading(*model, info.state, info, control)
+        return self.readings.read(here, start, chosen)
+
     def keyframe(self, name: str) -> Keyframe:
         """Returns the state and controls of a keyframe.
 
@@ -205,8 +254,8 @@ def from_mjcf(
     The attribute gravcomp becomes a constant `jc.forces.Force`. It does not follow later changes of
     mass or gravity.
 
-    Features without effect on the motion (sites, cameras, sensors) are dropped. Unsupported
-    features with an effect raise an error that names them.
+    The method `sensors` of the model reads its sensors. Features without effect on the motion, such
+    as cameras, are dropped. Unsupported features with an effect raise an error that names them.
 
     Actuators act on joints, or at sites: without a reference site as a `jc.joints.Thrust`, which
     adds a force and a torque that turn with the site.
@@ -266,8 +315,9 @@ def from_mjcf(
         frame = compiled.data.xpos[link.body], compiled.data.xquat[link.body]
         body = solid(compiled, link, scene.dtype)
         scene.add_body(link.name, inertia=body, position=frame[0], quaternion=frame[1])
-    coordinates = _add_elements(scene, compiled, links, names, count_turns)
+    coordinates, transmissions = _add_elements(scene, compiled, links, names, count_turns)
     system, state = scene.build()
+    sensors = Importer(compiled, links, names, transmissions, system).sensors()
     m = compiled.model
 
     def cast(x: np.ndarray) -> Array:
@@ -285,6 +335,7 @@ def from_mjcf(
         cast(timestep),
         _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
+        sensors,
         tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),
         tuple(compiled.name("key", i) for i in range(m.nkey)),
     )
@@ -292,11 +343,12 @@ def from_mjcf(
 
 def _add_elements(
     scene: Scene, compiled: Compiled, links: tuple[Link, ...], names: Names, count: bool
-) -> dict[int, Coordinate]:
+) -> tuple[dict[int, Coordinate], list[Transmission]]:
     """Adds joints, equality constraints, actuators, passive elements and contacts to a scene.
 
     Returns:
-        The scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        The scene coordinate of each hinge and slide, by MuJoCo's joint id; and the transmissions of
+        the actuators.
     """
     coordinates: dict[int, Coordinate] = {}
     for link in links:
@@ -306,7 +358,8 @@ def _add_elements(
             scene.add(element)
     for element in equalities(compiled, links, coordinates, names):
         scene.add(element)
-    for element in actuators(compiled, links, coordinates, names):
+    acting = actuators(compiled, links, coordinates, names)
+    for element in acting.elements:
         scene.add(element)
     for link in links:
         for joint in link.joints:
@@ -320,7 +373,7 @@ def _add_elements(
         scene.add(element)
     for element in contacts(compiled, links, names):
         scene.add(element)
-    return coordinates
+    return coordinates, acting.transmissions
 
 
 def _tree(

@@ -23,6 +23,7 @@ from jaxcon.system.elements import Elements, Named, label
 from jaxcon.system.forces import Pulls
 
 if TYPE_CHECKING:
+    from jaxcon.constraints.primitives import Row
     from jaxcon.system.body_system import Snapshot
 
 SHAPES: dict[str, tuple[int, ...]] = {
@@ -314,14 +315,23 @@ class JointForces(Elements):
 
         If control is None, the control inputs are zero.
         """
-        coordinate = self.coordinate.read(snapshot)
+        row = self.coordinate.read(snapshot)
+        force = self.along(row, control)
+        return [(p, pull * force) for p, pull in zip(self.places, row.pulls, strict=True)]
+
+    def along(self, row: Row, control: Array | None) -> Lane:
+        """Returns the forces along the coordinates θ, (element,) [N, N m].
+
+        Args:
+            row: the coordinates, from `JointCoordinate.read`.
+            control: the control inputs; zero if None.
+        """
         u: Lane = 0.0
         if self.starts and control is not None:
             u = clip(self.params, "control_range", take(control, self.starts))
         gear = self.params.get("gear", 1.0)
-        force = self.law.force(self.params, u, gear * coordinate.value, gear * coordinate.rate)
-        force = gear * clip(self.params, "force_range", force)
-        return [(p, pull * force) for p, pull in zip(self.places, coordinate.pulls, strict=True)]
+        force = self.law.force(self.params, u, gear * row.value, gear * row.rate)
+        return gear * clip(self.params, "force_range", force)
 
     def anchors(self, snapshot: Snapshot) -> Vector | None:
         """Returns the anchors of the joints, world frame [m]; None without anchors."""
