@@ -1,12 +1,13 @@
 """Springs, dampers, actuators and applied forces.
 
-Springs and dampers: Spring, JointSpring, JointDamper, Bending, Flexure.
+Springs and dampers: Spring, JointSpring, DeadBandSpring, JointDamper, Bending, Flexure.
 Actuators: Motor, PositionServo, VelocityServo, AffineActuator.
 Applied forces: ExternalWrench, CustomForce, Force.
 """
 
 from jaxcon.system.actuators import (
     AffineActuator,
+    DeadBandSpring,
     JointDamper,
     JointSpring,
     Motor,
@@ -25,6 +26,7 @@ def __dir__() -> list[str]:
 __all__ = [
     "Spring",
     "JointSpring",
+    "DeadBandSpring",
     "JointDamper",
     "Bending",
     "Flexure",

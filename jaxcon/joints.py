@@ -2,7 +2,7 @@
 
 Joints: Revolute, Prismatic, Spherical, Fixed, Distance, Coincident, Cylindrical, Universal, Planar,
     Screw, ConstantVelocity, RevoluteSpherical, SphericalSpherical, Span, Twist, RotationAngle,
-    Thrust, Parallel, PointOnLine, PointOnPlane, PointOnCurve, Compound.
+    Thrust, Tendon, Parallel, PointOnLine, PointOnPlane, PointOnCurve, Compound.
 Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, Armature.
 Prescribed motions: Drive.
 Rolling and blades: RollingDisc, RollingSphere, RollingCylinder, KnifeEdge.
@@ -42,6 +42,7 @@ from jaxcon.constraints.pairs import (
     Universal,
 )
 from jaxcon.constraints.rolling import KnifeEdge, RollingCylinder, RollingDisc, RollingSphere
+from jaxcon.constraints.tendons import Tendon
 from jaxcon.system.coordinates import TurnCounter
 
 
@@ -68,6 +69,7 @@ __all__ = [
     "Twist",
     "RotationAngle",
     "Thrust",
+    "Tendon",
     "Parallel",
     "PointOnLine",
     "PointOnPlane",

@@ -37,6 +37,12 @@ ELEMENTS = {
     "angle in the world": [jc.joints.RotationAngle("x", jc.WORLD, "b")],
     "thrust": [jc.joints.Thrust("x", "a", "b", (0.2, 0.3, 0), (1, 2, 0), (0.3, 0, 1))],
     "thrust in the world": [jc.joints.Thrust("x", jc.WORLD, "b", (0.2, 0.3, 0), (1, 2, 0))],
+    "tendon": [
+        jc.joints.Span("there", "a", "b", (0, 0, 0), (0.5, 0.2, 0.3)),
+        jc.joints.Span("on", "b", "c", (0.5, 0.2, 0.3), (1, 0.1, 0.4)),
+        jc.joints.RotationAngle("turn", jc.WORLD, "c"),
+        jc.joints.Tendon("x", ("there", "on", "turn"), (1.0, 0.5, -0.3)),
+    ],
 }
 
 
@@ -119,3 +125,114 @@ def test_a_thruster_accelerates_a_body(dtype):
     u = jnp.asarray(0.7, dtype)
     np.testing.assert_allclose(jax.jit(lifted)(u), [0, 0, 6 * u], atol=1e-6)
     np.testing.assert_allclose(jax.jit(jax.jacfwd(lifted))(u), [0, 0, 6], atol=1e-6)
+
+
+def arm(dtype, *elements, dim=3):
+    """A double pendulum in the x-y plane."""
+    scene = jc.Scene(dim=dim, gravity=(0, -9.81, 0)[:dim], dtype=dtype)
+    axis = (0, 0, 1) if dim == 3 else None
+    for i, above in enumerate((jc.WORLD, "link 0")):
+        at = (0.5 + i, 0, 0) if dim == 3 else (0.5 + i, 0)
+        inertia = (0.01, 0.1, 0.1) if dim == 3 else 0.1
+        scene.add_body(f"link {i}", mass=1.0, inertia=inertia, position=at)
+        hinge = (float(i), 0, 0) if dim == 3 else (float(i), 0)
+        scene.add(jc.Revolute(f"hinge {i}", above, f"link {i}", point=hinge, axis=axis))
+    for element in elements:
+        scene.add(element)
+    return scene.build()
+
+
+TENDON = jc.joints.Tendon("tendon", ("hinge 0", "hinge 1"), (0.3, -0.2))
+
+
+@pytest.mark.parametrize("dim", [2, 3])
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_elements_act_on_tendons(dim, dtype):
+    """Motor, spring and damper act by their moment arms; the gradient by an arm is exact."""
+    elements = (
+        jc.Motor("motor", "tendon", gear=2.0),
+        jc.forces.DeadBandSpring("spring", "tendon", 30.0, 0.05, 0.1, damping=0.4),
+    )
+    system, state = arm(dtype, TENDON, *elements, dim=dim)
+    plain, _ = arm(dtype, *(jc.Motor(f"motor {i}", f"hinge {i}") for i in (0, 1)), dim=dim)
+    v = state.v.at[-1].set(0.3)
+    q = system.retract(state.q, state.v.at[-1].set(-0.7))
+    state = state.replace(q=q, v=v)
+
+    def accelerations(arms, u):
+        changed = system.with_params({"tendon": {"coefficients": arms}})
+        found = jc.forward_dynamics(changed, state, u[None], jc.Method(), DT)
+        length = jc.coordinate(changed, state, "tendon")
+        rate = jc.coordinate_rate(changed, state, "tendon")
+        spring = -30 * (length - jnp.clip(length, 0.05, 0.1)) - 0.4 * rate
+        plainly = state.replace(turns=())
+        given = plain, plainly, arms * (2 * u + spring), jc.Method(), DT
+        return found.acceleration, jc.forward_dynamics(*given).acceleration
+
+    given = jnp.array([0.3, -0.2], dtype), jnp.asarray(1.5, dtype)
+    both = jax.jit(lambda *x: (accelerations(*x), jax.jacfwd(accelerations)(*x)))
+    (got, expected), slopes = both(*given)
+    tolerance = 1e-9 if dtype == jnp.float64 else 2e-4
+    np.testing.assert_allclose(got, expected, atol=tolerance * 50)
+    np.testing.assert_allclose(*slopes, atol=tolerance * 500)
+    energy = jc.energy(system, state).potential
+    energy -= jc.energy(plain, state.replace(turns=())).potential
+    length = jc.coordinate(system, state, "tendon")
+    np.testing.assert_allclose(energy, 15 * max(length - 0.1, 0) ** 2, rtol=1e-4)
+
+
+@pytest.mark.parametrize("solver", [None, jc.solvers.GaussSeidel(), jc.solvers.InteriorPoint()])
+def test_a_tendon_ends_rubs_and_couples(solver):
+    """A falling arm is held by a limit and dry friction of tendons, for all contact solvers."""
+    other = jc.joints.Tendon("other", ("hinge 0", "hinge 1"), (1.0, 0.5))
+    elements = (
+        jc.Limit("end", "tendon", lower=-0.2, upper=0.1),
+        jc.contacts.JointFriction("rub", "other", 0.5),
+    )
+    system, state = arm(None, TENDON, other, *elements)
+    method = jc.Method(contact_solver=solver)
+    run = jax.jit(jax.vmap(lambda s: jc.rollout(system, method, s, None, 2e-3, 150)[0]))
+    state = jc.init(system, method, state.q, state.v)
+    end = run(jax.tree.map(lambda x: jnp.stack([x, x]), state))
+    assert not np.any(end.status)
+    length = jc.coordinate(system, end[0], "tendon")
+    np.testing.assert_allclose(length, -0.2, atol=1e-3)
+
+
+def test_a_coupling_of_tendons_holds():
+    other = jc.joints.Tendon("other", ("hinge 0",), (0.5,))
+    gear = jc.joints.Gear("gear", "tendon", "other", ratio=2.0)
+    system, state = arm(None, TENDON, other, gear)
+    end, info = jc.rollout(system, jc.Method(), state, None, 2e-3, 150)
+    first, second = (jc.coordinate(system, end, x) for x in ("tendon", "other"))
+    assert abs(first) > 0.01
+    np.testing.assert_allclose(second, 2 * first, atol=1e-5)
+
+
+def test_tendons_of_one_kind_share_their_code():
+    tendons = [jc.joints.Tendon(f"t{i}", ("hinge 0", "hinge 1"), (1, i)) for i in range(5)]
+    springs = [jc.forces.JointSpring(f"s{i}", f"t{i}", 1.0) for i in range(5)]
+    system, state = arm(None, *tendons, *springs)
+    assert [group.names for group in system.forces] == [("s0", "s1", "s2", "s3", "s4")]
+    assert len(system.constraints) == 3
+    assert jnp.shape(jc.coordinate(system, state, "t3")) == ()
+
+
+@pytest.mark.parametrize(
+    ("tendon", "match"),
+    [
+        (jc.joints.Tendon("t", ()), "joints must be a tuple with at least one name, got \\(\\)"),
+        (jc.joints.Tendon("t", ("nothing",)), "joint 'nothing' is unknown"),
+        (jc.joints.Tendon("t", ("hinge 0",), (1, 2)), "coefficients must have shape \\(1,\\)"),
+        (jc.joints.Tendon("t", ("hinge 0",), (1,), ("a", "b")), "coordinates must be 1 names"),
+        (jc.joints.Tendon("t", ("hinge 0",) * 2), "couples a coordinate with itself"),
+    ],
+)
+def test_wrong_tendons_are_named(tendon, match):
+    with pytest.raises(ValueError, match=match):
+        arm(None, tendon)
+
+
+def test_a_dead_band_is_not_reversed():
+    with pytest.raises(ValueError, match="lower must not be above upper, got 0.2 and 0.1"):
+        arm(None, TENDON, jc.forces.DeadBandSpring("s", "tendon", 1.0, 0.2, 0.1))

@@ -332,19 +332,12 @@ def test_equalities_that_are_not_active_are_left_out():
 
 HINGE = f'<body name="b"><joint name="j" {{}}/>{BODY}{{}}</body>'
 GEOM = '<geom name="{}" size="0.1 0.1 0.1" {}/>'
-TENDON = '<tendon><fixed name="t" {}><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "shape": (
         model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
     "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
-    "tendon": (model(HINGE.format("", ""), TENDON.format('stiffness="1"')), "tendons 't'"),
-    "tendon that ends": (model(HINGE.format("", ""), TENDON.format('range="0 1"')), "tendons 't'"),
-    "tendon that rubs": (
-        model(HINGE.format("", ""), TENDON.format('frictionloss="1"')),
-        "tendons 't'",
-    ),
 }
 
 
@@ -405,11 +398,6 @@ UNSUPPORTED = {
     "friction that depends on the direction, of floor and g \\(sphere": model(
         HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
         '<contact><pair geom1="floor" geom2="g" condim="6" friction="1 1 0 1 2"/></contact>',
-    ),
-    "equality 'e' is of type 'tendon'": model(
-        HINGE.format("", ""),
-        '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
-        '<equality><tendon name="e" tendon1="t"/></equality>',
     ),
     "gear with a force and a torque": model(
         f'<body><freejoint name="f"/>{BODY}</body>',

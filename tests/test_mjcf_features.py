@@ -311,3 +311,116 @@ def test_errors_of_sensors_name_them():
             read.sensors(state, names=names)
     assert read.sensors(state, control=jnp.array([3.0]), names=("pull",)) == 3
     assert jc.from_mjcf(model(body)).sensors(state).shape == (0,)
+
+
+STRUNG = (
+    '<site name="post" pos="0.3 0.4 1.2"/><site name="beam" pos="-0.4 0.3 1"/>'
+    f'<body name="a" pos="0 0 1"><joint name="ja" axis="0 1 0" ref="0.2"/>{BODY}'
+    '<site name="a1" pos="0.2 0.1 0"/><site name="a2" pos="0 0.2 -0.3"/>'
+    f'<body name="b" pos="0 0.1 -0.5"><joint name="jb" axis="1 0 0.2"/>{SMALL}'
+    '<site name="b1" pos="0.1 0 -0.2"/><site name="b2" pos="-0.1 0.1 0"/>'
+    f'<body name="c" pos="0 0 -0.4"><joint name="jc" type="slide" axis="0 0.1 1"/>{SMALL}'
+    '<site name="c1" pos="0.1 0.1 0.1"/></body></body></body>'
+    f'<body name="d" pos="1 0 0"><freejoint/>{SMALL}<site name="d1" pos="0.1 0 0.2"/></body>'
+)
+TENDONS = """<tendon>
+<fixed name="mixed" stiffness="5" springlength="0.1 0.3" damping="0.7" armature="0.3" {0}>
+  <joint joint="ja" coef="0.7"/><joint joint="jb" coef="-0.4"/><joint joint="jc" coef="2"/></fixed>
+<fixed name="pair" stiffness="3" {1}><joint joint="jb" coef="1.5"/><joint joint="ja" coef="0.3"/>
+  </fixed>
+<fixed name="other" damping="0.4"><joint joint="jb" coef="0.5"/><joint joint="ja" coef="2"/></fixed>
+<spatial name="rope" stiffness="8" damping="0.5" {2}><site site="post"/>
+  <site site="a1"/><site site="a2"/><site site="b1"/><pulley divisor="2"/><site site="beam"/>
+  <site site="c1"/><site site="d1"/></spatial>
+<spatial name="line" springlength="0 2" stiffness="4"><site site="b2"/><site site="d1"/></spatial>
+<spatial name="reel" armature="0.2"><site site="post"/><site site="a1"/><site site="b1"/></spatial>
+<spatial name="plain"><site site="d1"/><site site="post"/></spatial></tendon>"""
+ON_TENDONS = """<actuator><motor name="winch" tendon="rope" gear="2"/>
+<position name="servo" tendon="mixed" kp="3" kv="0.4" gear="1.5"/>
+<general name="both" tendon="rope" gear="-1" gainprm="3" biastype="affine" biasprm="0.3 -2 -0.2"
+  forcerange="-1 2"/></actuator>"""
+TENDON_SENSORS = "".join(
+    f'<tendon{what} tendon="{name}"/>'
+    for what in ("pos", "vel", "actuatorfrc")
+    for name in ("mixed", "rope", "plain")
+)
+TENDON_SENSORS = f'<sensor>{TENDON_SENSORS}<jointactuatorfrc joint="jb"/></sensor>'
+
+
+def test_tendons_are_those_of_mujoco():
+    """Rotors are on tendons along one branch: between branches MuJoCo neglects their inertia."""
+    m = model(STRUNG, TENDONS.format("", "", "") + ON_TENDONS + TENDON_SENSORS)
+    assert agreement.acceleration_error(m) < AGREE
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    states = agreement.random_states(m, 20)
+    readings = agreement.quick(jax.vmap(lambda q, v, u: read.sensors(read.state(q, v), control=u)))
+    got = readings(*map(jnp.asarray, states))
+    for i in range(20):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = (x[i] for x in states)
+        mujoco.mj_forward(m, data)
+        np.testing.assert_allclose(got[i], data.sensordata, atol=1e-8)
+
+
+def test_ranges_and_friction_of_tendons():
+    """Gaps, rates and bounds are those of MuJoCo's rows; reactions are tested by hand elsewhere."""
+    ranges = 'range="-9 0.1" margin="3"', 'frictionloss="0.6"', 'range="5 9" frictionloss="0.2"'
+    text = (
+        f'<mujoco><compiler angle="radian"/><worldbody>{STRUNG}</worldbody>'
+        f"{TENDONS.format(*ranges)}</mujoco>"
+    )
+    m = mujoco.MjModel.from_xml_string(text)
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    states = agreement.random_states(m, 20)
+
+    def rows(qpos, qvel):
+        state = read.state(qpos, qvel)
+        dt, control = jnp.asarray(1e-3), jnp.zeros(0)
+        return linearize_bounds(read.system, state.q, state.v, state.time, control, dt)
+
+    found = agreement.quick(jax.vmap(rows))(*map(jnp.asarray, states[:2]))
+    layout = found.layout
+    order = ("pair friction", "rope friction", "mixed limit", "rope limit")
+    at = [int(layout.rows(name)[0]) for name in order]
+    for i in range(20):
+        data.qpos[:], data.qvel[:] = states.qpos[i], states.qvel[i]
+        mujoco.mj_forward(m, data)
+        gaps = (data.efc_pos - data.efc_margin)[2:]
+        np.testing.assert_allclose(found.rate[i][np.array(at)], data.efc_vel, atol=1e-8)
+        np.testing.assert_allclose(found.gap[i][np.array(at[2:])], gaps, atol=1e-8)
+    np.testing.assert_allclose(found.upper[0], data.efc_frictionloss[:2])
+
+
+def test_equalities_of_tendons():
+    """The residuals of a polynomial coupling and of a held tendon are those of MuJoCo."""
+    equality = (
+        '<equality><tendon name="cam" tendon1="rope" tendon2="mixed" polycoef="0.1 0.2 0.3 -1 0"/>'
+        '<tendon name="held" tendon1="line" polycoef="0.2 0 0 0 0"/></equality>'
+    )
+    m = model(STRUNG, TENDONS.format("", "", "") + equality)
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    qpos, qvel, _ = agreement.random_states(m, 3)
+    for i in range(3):
+        data.qpos[:], data.qvel[:] = qpos[i], qvel[i]
+        mujoco.mj_forward(m, data)
+        found = jc.violation(read.system, read.state(qpos[i], qvel[i]))
+        expected = {"cam": data.efc_pos[0], "held": data.efc_pos[1]}
+        for name, x in expected.items():
+            np.testing.assert_allclose(found[name], abs(x), rtol=1e-9)
+
+
+def test_tendons_can_be_left_out_and_wrapped_ones_are_named():
+    passive = model(STRUNG, TENDONS.format("", "", "") + ON_TENDONS)
+    names = jc.from_mjcf(passive, ignore=("tendon",)).system.params
+    assert {"rope", "mixed"} <= set(names)  # actuators act on them
+    assert not {"rope spring", "pair", "line", "plain"} & set(names)
+    wrapped = (
+        '<tendon><spatial name="w" {}><site site="post"/><geom geom="drum"/><site site="d1"/>'
+        "</spatial></tendon>"
+    )
+    drum = '<geom name="drum" size="0.1" contype="0" conaffinity="0"/>'
+    sensor = '<sensor><tendonpos name="reach" tendon="w"/></sensor>'
+    with pytest.raises(NotImplementedError, match="tendon 'w' wraps around the geom 'drum'"):
+        jc.from_mjcf(model(STRUNG + drum, wrapped.format('stiffness="1"')))
+    read = jc.from_mjcf(model(STRUNG + drum, wrapped.format("") + sensor))
+    with pytest.raises(NotImplementedError, match="'reach' of type tendonpos is of a tendon that"):
+        read.sensors(read.start)

@@ -11,7 +11,7 @@ from jaxcon.constraints.measures import Thrust
 from jaxcon.constraints.pairs import Twist
 from jaxcon.core import checks
 from jaxcon.io.compiled import Compiled, Names
-from jaxcon.io.joints import Coordinate, pushing, turning
+from jaxcon.io.joints import Coordinate, Ends, pushing, turning
 from jaxcon.io.links import Link, LinkJoint, scene_body
 from jaxcon.system.actuators import AffineActuator, Motor
 from jaxcon.system.layout import WORLD
@@ -35,7 +35,7 @@ class Transmission(NamedTuple):
 
 
 LAWS = (
-    ("trntype", "mjtTrn", ("joint", "jointinparent", "site")),
+    ("trntype", "mjtTrn", ("joint", "jointinparent", "tendon", "site")),
     ("dyntype", "mjtDyn", ("none",)),
     ("gaintype", "mjtGain", ("fixed", "affine")),
     ("biastype", "mjtBias", ("none", "affine")),
@@ -70,7 +70,7 @@ class Actuators(NamedTuple):
 def actuators(
     compiled: Compiled,
     links: tuple[Link, ...],
-    coordinates: dict[int, Coordinate],
+    ends: Ends,
     names: Names,
 ) -> Actuators:
     """Returns the scene elements of all actuators of a model.
@@ -78,7 +78,7 @@ def actuators(
     Args:
         compiled: the model.
         links: the links of the model.
-        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        ends: the scene coordinates of joints and tendons.
         names: the names in the scene.
 
     Raises:
@@ -88,10 +88,14 @@ def actuators(
     for i in range(len(m.actuator_trntype)):
         _check(compiled, i)
         name = names.take(compiled.name("actuator", i), "actuator")
-        if compiled.choice("mjtTrn", m.actuator_trntype[i]) == "site":
+        kind, element = compiled.choice("mjtTrn", m.actuator_trntype[i]), None
+        if kind == "site":
             element, transmission = _at_site(compiled, i, links, names)
+        elif kind == "tendon":
+            t, gear = int(m.actuator_trnid[i, 0]), float(m.actuator_gear[i, 0])
+            transmission = Transmission(ends.tendons[t], gear, float(m.tendon_length0[t]))
         else:
-            element, transmission = _on_joint(compiled, i, links, coordinates, names)
+            element, transmission = _on_joint(compiled, i, links, ends.joints, names)
         found.elements.extend([] if element is None else [element])
         found.elements.append(_law(compiled, i, name, transmission))
         found.transmissions.append(transmission)
@@ -165,24 +169,28 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     """Returns the force range of an actuator, (2,); None if there are no limits.
 
     It is the range of the actuator's force before multiplication by the gear ratio. It respects the
-    limits of the actuator and of its joint.
+    limits of the actuator and of its joint or tendon.
 
     Raises:
-        NotImplementedError: the joint limits the sum of several actuators.
+        NotImplementedError: the joint or tendon limits the sum of several actuators.
     """
-    m, joint = compiled.model, int(compiled.model.actuator_trnid[i, 0])
+    m, owner = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
     kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
-    if kinds[i] == "site" or not m.jnt_actfrclimited[joint] or not gear:
+    if kinds[i] == "site" or not gear:
         return of_actuator
-    on_joint = np.isin(kinds, ("joint", "jointinparent")) & (m.actuator_trnid[:, 0] == joint)
-    if sum(on_joint) > 1:
+    what, field = ("tendon", "tendon") if kinds[i] == "tendon" else ("joint", "jnt")
+    if not getattr(m, f"{field}_actfrclimited")[owner]:
+        return of_actuator
+    same = ("tendon",) if what == "tendon" else ("joint", "jointinparent")
+    beside = np.isin(kinds, same) & (m.actuator_trnid[:, 0] == owner)
+    if sum(beside) > 1:
         raise NotImplementedError(
-            f"from_mjcf: joint '{compiled.name('joint', joint)}' has an actuatorfrcrange and"
-            f" {sum(on_joint)} actuators, whose sum it limits; give each a forcerange instead."
+            f"from_mjcf: {what} '{compiled.name(what, owner)}' has an actuatorfrcrange and"
+            f" {sum(beside)} actuators, whose sum it limits; give each a forcerange instead."
         )
-    of_joint = np.sort(m.jnt_actfrcrange[joint] / gear)
-    return of_joint if of_actuator is None else np.clip(of_actuator, *of_joint)
+    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / gear)
+    return limits if of_actuator is None else np.clip(of_actuator, *limits)
 
 
 def _vector(

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxcon.constraints.tendons import Tendons
 from jaxcon.contact.contact import Contacts
 from jaxcon.contact.limits import Bounds
 from jaxcon.core.pytree import pytree, static
@@ -286,6 +287,17 @@ class Reading:
             force = group.along(row, self.control)
             lanes = [jnp.broadcast_to(x, (len(group.names),)) for x in (row.value, row.rate, force)]
             found |= {name: tuple(x[i] for x in lanes) for i, name in enumerate(group.names)}
+        return found
+
+    @cached_property
+    def tendons(self) -> dict[str, tuple[Array, Array]]:
+        """The change of length since assembly and its rate, of each tendon by name."""
+        found = {}
+        for group in self.system.constraints:
+            if isinstance(group, Tendons):
+                row = group.coordinate_rows(self.snapshot, "length")["length"]
+                value, rate = jnp.asarray(row.value), jnp.asarray(row.rate)
+                found |= {name: (value[i], rate[i]) for i, name in enumerate(group.names)}
         return found
 
     @cached_property

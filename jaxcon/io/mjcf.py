@@ -21,7 +21,7 @@ from jaxcon.io.actuators import Transmission, actuators
 from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
 from jaxcon.io.equalities import equalities
-from jaxcon.io.joints import Coordinate, join
+from jaxcon.io.joints import Coordinate, Ends, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Tree
 from jaxcon.io.measuring import Reading
@@ -29,6 +29,7 @@ from jaxcon.io.passive import gravity_compensation, passive
 from jaxcon.io.refusals import left_out, refuse
 from jaxcon.io.sensor_import import Importer
 from jaxcon.io.sensors import Sensors
+from jaxcon.io.tendons import passive_tendons, tendons
 from jaxcon.methods.method import Method
 from jaxcon.step import StepInfo
 from jaxcon.system.body_system import BodySystem
@@ -260,6 +261,10 @@ def from_mjcf(
     Actuators act on joints, or at sites: without a reference site as a `jc.joints.Thrust`, which
     adds a force and a torque that turn with the site.
 
+    Tendons become a `jc.joints.Tendon`: over joints, or over a `jc.joints.Span` for each segment
+    between sites. Tendons that wrap around geoms are not supported. Their springs, dampers, ranges,
+    friction and rotors are those of joints.
+
     Ranges of hinges and slides become `jc.contacts.Limit`. Ranges of ball joints limit a
     `jc.joints.RotationAngle`. The attribute frictionloss becomes
     `jc.contacts.JointFriction`. Pairs of geoms become contacts: spheres, capsules and boxes on
@@ -289,7 +294,7 @@ def from_mjcf(
             "limit": all joint limits,
             "ball_limit": limits of ball joints,
             "friction": dry friction of joints,
-            "tendon": tendons,
+            "tendon": springs, dampers, rotors, friction and ranges of tendons,
             "fluid": density and viscosity,
             "gravcomp": gravity compensation.
         count_turns: True to count the whole turns of every hinge, so that `qpos` includes them.
@@ -344,7 +349,7 @@ def from_mjcf(
 def _add_elements(
     scene: Scene, compiled: Compiled, links: tuple[Link, ...], names: Names, count: bool
 ) -> tuple[dict[int, Coordinate], list[Transmission]]:
-    """Adds joints, equality constraints, actuators, passive elements and contacts to a scene.
+    """Adds joints, tendons, equalities, actuators, passive elements and contacts to a scene.
 
     Returns:
         The scene coordinate of each hinge and slide, by MuJoCo's joint id; and the transmissions of
@@ -356,9 +361,13 @@ def _add_elements(
         coordinates |= joined.coordinates
         for element in joined.elements:
             scene.add(element)
-    for element in equalities(compiled, links, coordinates, names):
+    strung = tendons(compiled, links, coordinates, names)
+    for element in (*strung.elements, *passive_tendons(compiled, strung.coordinates, names)):
         scene.add(element)
-    acting = actuators(compiled, links, coordinates, names)
+    ends = Ends(coordinates, strung.coordinates)
+    for element in equalities(compiled, links, ends, names):
+        scene.add(element)
+    acting = actuators(compiled, links, ends, names)
     for element in acting.elements:
         scene.add(element)
     for link in links:

@@ -14,6 +14,9 @@ from jaxcon.io.pairs import GeomPair
 ZERO = (
     ("joint", "jnt_stiffnesspoly", "polynomial stiffness"),
     ("joint", "jnt_springyield", "a spring that yields"),
+    ("tendon", "tendon_stiffnesspoly", "polynomial stiffness"),
+    ("tendon", "tendon_dampingpoly", "polynomial damping"),
+    ("tendon", "tendon_springyield", "a spring that yields"),
     ("actuator", "actuator_damping", "damping"),
     ("actuator", "actuator_dampingpoly", "polynomial damping"),
     ("actuator", "actuator_armature", "armature"),
@@ -28,17 +31,6 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
-def tendons(compiled: Compiled) -> list[str]:
-    """Returns the names of all tendons with forces or limits; other tendons are only sensors."""
-    m = compiled.model
-    fields = ["stiffness", "damping", "armature"]
-    fields += [] if compiled.disabled("limit", "constraint") else ["limited"]
-    rubs = not compiled.disabled("friction", "frictionloss", "constraint")
-    fields += ["frictionloss"] if rubs else []
-    arrays = [np.asarray(getattr(m, f"tendon_{f}", np.zeros(m.ntendon))) != 0 for f in fields]
-    return _named(compiled, "tendon", np.any(arrays, axis=0))
-
-
 def fluid(compiled: Compiled) -> list[str]:
     """Returns the names of the nonzero fluid options, "density" and "viscosity"."""
     options = compiled.model.opt
@@ -47,7 +39,6 @@ def fluid(compiled: Compiled) -> list[str]:
 
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
-    "tendon": ("the tendons", tendons),
     "fluid": ("the option", fluid),
 }
 """The unsupported features that `ignore` may leave out.
@@ -56,6 +47,7 @@ Each entry has a description and a function that returns the names of the object
 """
 IGNORABLE = (
     *("contact", "self_contact", "torsion", "limit", "ball_limit", "friction", "gravcomp"),
+    "tendon",
     *REFUSED,
 )
 """The values that the argument `ignore` of `from_mjcf` may have."""
@@ -101,6 +93,8 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
         if getattr(m, count):
             yield f"a {what}, of which there are {getattr(m, count)},"
     for kind, field, what in ZERO:
+        if kind == "tendon" and compiled.disabled("tendon"):
+            continue
         for name in _named(compiled, kind, getattr(m, field, ())):
             yield f"{what} of {kind} '{name}'"
     if np.any(getattr(m, "dof_dampingpoly", 0.0)):

@@ -23,12 +23,14 @@ from jaxcon.io.sensors import (
     OF_JOINTS,
     OF_LIMITS,
     OF_SUBTREES,
+    OF_TENDONS,
     SUPPORTED,
     Entry,
     External,
     SensorGroup,
     Sensors,
 )
+from jaxcon.io.tendons import unsupported
 from jaxcon.system.body_system import BodySystem
 from jaxcon.system.layout import WORLD
 
@@ -93,9 +95,17 @@ class Importer:
             why = "is in a model with actuatorgravcomp, which is not supported"
         elif kind == "actuatorfrc" and not self.transmissions[int(m.sensor_objid[i])].gear:
             why = "is of an actuator with a gear of zero, which is not supported"
+        elif kind.startswith("tendon") and (why := self._missing(int(m.sensor_objid[i]))):
+            pass
         elif kind == "touch" and self._zone(int(m.sensor_objid[i])) not in zones.SHAPES:
             why = f"has a zone that is not one of {list(zones.SHAPES)}"
         return Entry(name, kind, int(m.sensor_adr[i]), int(m.sensor_dim[i]), why)
+
+    def _missing(self, tendon: int) -> str:
+        """Returns why a tendon was not imported; empty if it was."""
+        found = self.names.given.get((self.compiled.name("tendon", tendon), "tendon"))
+        why = unsupported(self.compiled, self.links, tendon)
+        return "" if found else f"is of a tendon that {why}"
 
     def _zone(self, site: int) -> str:
         """Returns the shape of a site, such as "sphere"."""
@@ -151,8 +161,24 @@ class Importer:
             more["elements"] = tuple(names.given[label, "actuator"] for label in labels)
             for field in ("gear", "reference", "measured"):
                 own[field] = np.array([float(getattr(x, field)) for x in chosen])
+        if kind in OF_TENDONS:
+            own["reference"] = m.tendon_length0[ids]
+            labels = [self.compiled.name("tendon", i) for i in ids]
+            more["elements"] = tuple(names.given[label, "tendon"] for label in labels)
+        if kind == "tendonactfrc":
+            acting = [i for i, x in enumerate(m.actuator_trntype) if self._pulls(i, x)]
+            labels = [self.compiled.name("actuator", i) for i in acting]
+            more["elements"] = tuple(names.given[label, "actuator"] for label in labels)
+            gears = [self.transmissions[i].gear for i in acting]
+            own["acting"] = np.array(
+                [
+                    [(m.actuator_trnid[i, 0] == t) / g for i, g in zip(acting, gears, strict=True)]
+                    for t in ids
+                ]
+            ).reshape(len(ids), len(acting))
         if kind in OF_LIMITS:
-            labels = [f"{self.compiled.name('joint', j)} limit" for j in ids]
+            what = "joint" if kind.startswith("joint") else "tendon"
+            labels = [f"{self.compiled.name(what, j)} limit" for j in ids]
             more["elements"] = tuple(names.given.get((label, "limit"), "") for label in labels)
         if kind in OF_SUBTREES:
             own["bodies"] = np.array([self._below(body) for body in ids])
@@ -175,6 +201,11 @@ class Importer:
             entries=tuple(entries[i] for i in numbers),
             **more,
         )
+
+    def _pulls(self, i: int, kind: int) -> bool:
+        """Returns True if actuator i with this type of transmission pulls a tendon."""
+        on_tendon = self.compiled.choice("mjtTrn", kind) == "tendon"
+        return on_tendon and self.transmissions[i].gear != 0
 
     def _objects(self, kinds: Sequence[int], ids: list[int]) -> Objects:
         """Returns frames as `Objects`."""

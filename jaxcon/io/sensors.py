@@ -31,14 +31,17 @@ FRAMES = (
 AT_SITES = ("velocimeter", "gyro", "accelerometer", "magnetometer", "force", "torque", "touch")
 OF_JOINTS = ("jointpos", "jointvel", "ballquat", "ballangvel", "jointactfrc")
 OF_ACTUATORS = ("actuatorpos", "actuatorvel", "actuatorfrc")
+OF_TENDONS = ("tendonpos", "tendonvel", "tendonactfrc")
 OF_LIMITS = ("jointlimitpos", "jointlimitvel", "jointlimitfrc")
+OF_LIMITS += ("tendonlimitpos", "tendonlimitvel", "tendonlimitfrc")
 OF_SUBTREES = ("subtreecom", "subtreelinvel", "subtreeangmom")
 OF_WORLDS = ("clock", "e_potential", "e_kinetic")
-SUPPORTED = (*FRAMES, *AT_SITES, *OF_JOINTS, *OF_ACTUATORS, *OF_LIMITS, *OF_SUBTREES, *OF_WORLDS)
+SUPPORTED = (*FRAMES, *AT_SITES, *OF_JOINTS, *OF_ACTUATORS, *OF_TENDONS, *OF_LIMITS)
+SUPPORTED += (*OF_SUBTREES, *OF_WORLDS)
 """The supported kinds of sensors, by what they measure."""
-OF_CONTROL = ("actuatorfrc", "jointactfrc")
+OF_CONTROL = ("actuatorfrc", "jointactfrc", "tendonactfrc")
 OF_INFO = ("framelinacc", "frameangacc", "accelerometer", "force", "torque", "touch")
-OF_INFO += ("jointlimitfrc",)
+OF_INFO += ("jointlimitfrc", "tendonlimitfrc")
 """The kinds that need the control inputs, and the kinds that need accelerations and reactions."""
 
 
@@ -294,6 +297,17 @@ def of_actuators(sensors: Sensors, reading: Reading, group: SensorGroup) -> Arra
     return x[group.kind][:, None]
 
 
+def of_tendons(sensors: Sensors, reading: Reading, group: SensorGroup) -> Array:
+    """Reads lengths and rates of tendons, and the sums of the forces of actuators on them."""
+    if group.kind == "tendonactfrc":
+        zero = jnp.zeros((1,), reading.state.q.dtype)
+        forces = [zero, *(reading.actuators[name][2][None] for name in group.elements)]
+        return group.numbers["acting"] @ jnp.concatenate(forces)[1:, None]
+    found = [reading.tendons[name] for name in group.elements]
+    value, rate = (jnp.stack(x) for x in zip(*found, strict=True))
+    return (value + group.numbers["reference"] if group.kind == "tendonpos" else rate)[:, None]
+
+
 def of_limits(sensors: Sensors, reading: Reading, group: SensorGroup) -> Array:
     """Reads penetrations, their rates and the forces of limits; zero where no limit acts."""
     zero = jnp.zeros_like(reading.state.time)
@@ -339,6 +353,7 @@ READERS: dict[str, Reader] = {
     "touch": of_touch,
     **dict.fromkeys(OF_JOINTS, of_joints),
     **dict.fromkeys(OF_ACTUATORS, of_actuators),
+    **dict.fromkeys(OF_TENDONS, of_tendons),
     **dict.fromkeys(OF_LIMITS, of_limits),
     **dict.fromkeys(OF_SUBTREES, of_subtrees),
     **dict.fromkeys(OF_WORLDS, of_the_world),

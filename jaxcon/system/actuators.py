@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from jaxcon.system.body_system import Snapshot
 
 SHAPES: dict[str, tuple[int, ...]] = {
-    **dict.fromkeys(("stiffness", "damping", "rest", "gear"), ()),
+    **dict.fromkeys(("stiffness", "damping", "rest", "gear", "lower", "upper"), ()),
     **dict.fromkeys(("gain", "bias"), (3,)),
     **dict.fromkeys(("control_range", "force_range"), (2,)),
 }
@@ -116,6 +116,67 @@ class JointSpring(JointForce):
     def potential(p: dict[str, Any], value: Lane) -> Lane:
         """Returns the energy ½ k (θ − θ₀)² of the spring at the coordinate θ [J]."""
         return p["stiffness"] * (value - p["rest"]) ** 2 / 2
+
+
+@dataclass(frozen=True)
+class DeadBandSpring(JointForce):
+    """A spring that is slack between two positions, and a damper about a joint's coordinate θ.
+
+    The force is −k (θ − clip(θ, lower, upper)) − c θ̇. θ is zero at assembly; angles count whole
+    turns.
+
+    Attributes:
+        name: name of the element, unique in the scene.
+        joint: name of the joint.
+        stiffness: k [N m/rad] or [N/m].
+        lower, upper: the positions between which the spring is slack [rad] or [m].
+        damping: c [N m s/rad] or [N s/m].
+        coordinate: name of the joint's coordinate; needed if the joint has several.
+    """
+
+    stiffness: Any
+    lower: Any
+    upper: Any
+    damping: Any = 0.0
+    coordinate: str | None = None
+
+    @classmethod
+    def check_numbers(cls, owner: str, numbers: Mapping[str, Any], dtype: DType) -> None:
+        """Checks that stiffness and damping are not negative, and that lower ≤ upper.
+
+        Args:
+            owner: first words of errors.
+            numbers: the numbers by field.
+            dtype: dtype of the scene.
+
+        Raises:
+            ValueError: a number is out of range.
+        """
+        super().check_numbers(owner, numbers, dtype)
+        lower, upper = numbers["lower"], numbers["upper"]
+        if checks.is_concrete((lower, upper)) and not lower <= upper:
+            raise ValueError(
+                f"{owner}: lower must not be above upper, got {checks.numerals(lower)} and"
+                f" {checks.numerals(upper)}."
+            )
+
+    @staticmethod
+    def force(p: dict[str, Any], u: Lane, value: Lane, rate: Lane) -> Lane:
+        """Returns the force −k (θ − clip(θ, lower, upper)) − c θ̇ along the joint's coordinate θ.
+
+        Args:
+            p: the numbers of the elements, by field.
+            u: unused.
+            value: θ.
+            rate: θ̇.
+        """
+        beyond = value - jnp.clip(value, p["lower"], p["upper"])
+        return -p["stiffness"] * beyond - p["damping"] * rate
+
+    @staticmethod
+    def potential(p: dict[str, Any], value: Lane) -> Lane:
+        """Returns the energy ½ k (θ − clip(θ, lower, upper))² at the coordinate θ [J]."""
+        return p["stiffness"] * (value - jnp.clip(value, p["lower"], p["upper"])) ** 2 / 2
 
 
 @dataclass(frozen=True)
