@@ -2,7 +2,7 @@
 
 Springs and dampers: Spring, JointSpring, DeadBandSpring, JointDamper, Bending, Flexure.
 Actuators: Motor, PositionServo, VelocityServo, AffineActuator.
-Applied forces: ExternalWrench, CustomForce, Force.
+Applied forces: ExternalWrench, CustomForce, Force, FluidDrag.
 """
 
 from jaxcon.system.actuators import (
@@ -15,6 +15,7 @@ from jaxcon.system.actuators import (
     VelocityServo,
 )
 from jaxcon.system.elastic import Bending, Flexure
+from jaxcon.system.fluid import FluidDrag
 from jaxcon.system.forces import CustomForce, ExternalWrench, Force, Spring
 
 
@@ -37,4 +38,5 @@ __all__ = [
     "ExternalWrench",
     "CustomForce",
     "Force",
+    "FluidDrag",
 ]

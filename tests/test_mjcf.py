@@ -337,7 +337,6 @@ REFUSED = {
         model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
-    "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
 }
 
 
@@ -406,6 +405,9 @@ UNSUPPORTED = {
     "'j', 'k'\\] of body 'b' pass each other": model(
         f'<body name="b"><joint name="j" axis="1 0 0"/>'
         f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
+    ),
+    "fluidshape of geom 'g'": model(
+        HINGE.format("", GEOM.format("g", 'fluidshape="ellipsoid"')), options='density="1.2"'
     ),
     "actuatorgravcomp of joint 'j' beside": model(
         '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'

@@ -23,9 +23,10 @@ SMALL = '<inertial pos="0 0.1 0" quat="1 0.3 0 0.2" mass="0.7" diaginertia="0.02
 
 
 def model(bodies, rest="", options=""):
+    flag = '<flag contact="disable" limit="disable"/>'
     return mujoco.MjModel.from_xml_string(
-        '<mujoco><compiler angle="radian"/><option><flag contact="disable" limit="disable"/>'
-        f"{options}</option><worldbody>{bodies}</worldbody>{rest}</mujoco>"
+        f'<mujoco><compiler angle="radian"/><option {options}>{flag}</option>'
+        f"<worldbody>{bodies}</worldbody>{rest}</mujoco>"
     )
 
 
@@ -49,6 +50,16 @@ def test_gravity_compensation_can_be_left_out():
     assert not any("gravcomp" in x for x in jc.from_mjcf(m, ignore=("gravcomp",)).system.params)
     m.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     assert not any("gravcomp" in x for x in jc.from_mjcf(m).system.params)
+
+
+@pytest.mark.parametrize(
+    "fluid", ['density="900"', 'viscosity="2"', 'density="1.2" viscosity="0.3" wind="1 -2 3"']
+)
+def test_drag_is_that_of_mujoco(fluid):
+    m = model(COMPENSATED, options=fluid)
+    m.jnt_actgravcomp[:] = 0
+    assert agreement.acceleration_error(m) < AGREE
+    assert not any("drag" in name for name in jc.from_mjcf(m, ignore=("fluid",)).system.params)
 
 
 SITE = '<site name="{}" pos="0.3 0.1 -0.2" euler="0.4 0.1 0.2"/>'

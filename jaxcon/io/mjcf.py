@@ -25,7 +25,7 @@ from jaxcon.io.joints import Coordinate, Ends, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Tree
 from jaxcon.io.measuring import Reading
-from jaxcon.io.passive import gravity_compensation, passive
+from jaxcon.io.passive import fluid_drag, gravity_compensation, passive
 from jaxcon.io.refusals import left_out, refuse
 from jaxcon.io.sensor_import import Importer
 from jaxcon.io.sensors import Sensors
@@ -253,7 +253,8 @@ def from_mjcf(
     step size are not imported; `timestep` is the step size in the model.
 
     The attribute gravcomp becomes a constant `jc.forces.Force`. It does not follow later changes of
-    mass or gravity.
+    mass or gravity. Density and viscosity become a `jc.forces.FluidDrag` on the inertia box of each
+    body. The model of ellipsoids (fluidshape) is not supported.
 
     The method `sensors` of the model reads its sensors. Features without effect on the motion, such
     as cameras, are dropped. Unsupported features with an effect raise an error that names them.
@@ -378,8 +379,9 @@ def _add_elements(
             if count and at is not None and joint.kind == "hinge":
                 label = compiled.name("joint", joint.id)
                 scene.add(TurnCounter(names.take(f"{label} turns", "turns"), *at))
-    for element in gravity_compensation(compiled, links, names):
-        scene.add(element)
+    for on_bodies in (gravity_compensation, fluid_drag):
+        for element in on_bodies(compiled, links, names):
+            scene.add(element)
     for element in contacts(compiled, links, names):
         scene.add(element)
     return coordinates, acting.transmissions

@@ -1,6 +1,6 @@
 """Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints.
 
-Gravity compensation of bodies is imported here, too.
+Gravity compensation and drag of bodies are imported here, too.
 """
 
 from __future__ import annotations
@@ -19,9 +19,12 @@ from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
 from jaxcon.io.links import Link, LinkJoint, scene_body
 from jaxcon.system.actuators import JointDamper, JointSpring
+from jaxcon.system.fluid import FluidDrag
 from jaxcon.system.forces import Force
 from jaxcon.system.layout import WORLD
 
+SMALLEST = 1e-15
+"""MuJoCo's mjMINVAL: lighter bodies have no drag, and squares of sizes are at least as large."""
 Joint: TypeAlias = Compound | Twist | RotationAngle
 Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Joint
 """A scene element: a passive element, or a joint without constraint rows.
@@ -75,8 +78,7 @@ def gravity_compensation(
     if both springs and dampers are disabled.
     """
     m = compiled.model
-    passive = not (compiled.disabled("spring") and compiled.disabled("damper"))
-    if compiled.disabled("gravity", "gravcomp") or not passive:
+    if compiled.disabled("gravity", "gravcomp") or not has_passive_forces(compiled):
         return
     for body in map(int, np.flatnonzero(m.body_gravcomp)):
         link = scene_body(compiled, links, body)
@@ -84,6 +86,39 @@ def gravity_compensation(
             name = names.take(f"{compiled.name('body', body)} gravcomp", "force")
             force = -m.body_gravcomp[body] * m.body_mass[body] * m.opt.gravity
             yield Force(name, link, force, compiled.data.xipos[body])
+
+
+def has_passive_forces(compiled: Compiled) -> bool:
+    """Returns False if springs and dampers are disabled; MuJoCo then has no passive forces."""
+    return not (compiled.disabled("spring") and compiled.disabled("damper"))
+
+
+def fluid_drag(compiled: Compiled, links: tuple[Link, ...], names: Names) -> Iterator[FluidDrag]:
+    """Yields the drag of the fluid on the inertia box of each body.
+
+    The box has the mass and the inertia of the body: bᵢ² = 6 (Iⱼ + Iₖ − Iᵢ)/m.
+    """
+    m = compiled.model
+    fluid = m.opt.density, m.opt.viscosity
+    if not any(fluid) or compiled.disabled("fluid") or not has_passive_forces(compiled):
+        return
+    for body in range(1, m.nbody):
+        link, mass = scene_body(compiled, links, body), m.body_mass[body]
+        if link == WORLD or mass < SMALLEST:
+            continue
+        moments = m.body_inertia[body]
+        squares = np.maximum(moments.sum() - 2 * moments, SMALLEST) * 6 / mass
+        turn = np.zeros(4)
+        compiled.mujoco.mju_mat2Quat(turn, compiled.data.ximat[body])
+        yield FluidDrag(
+            names.take(f"{compiled.name('body', body)} drag", "force"),
+            link,
+            np.sqrt(squares),
+            *fluid,
+            wind=m.opt.wind,
+            point=compiled.data.xipos[body],
+            orientation=turn,
+        )
 
 
 def _along(

@@ -31,15 +31,8 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
-def fluid(compiled: Compiled) -> list[str]:
-    """Returns the names of the nonzero fluid options, "density" and "viscosity"."""
-    options = compiled.model.opt
-    return [f for f in ("density", "viscosity") if getattr(options, f)]
-
-
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
-    "fluid": ("the option", fluid),
 }
 """The unsupported features that `ignore` may leave out.
 
@@ -47,7 +40,7 @@ Each entry has a description and a function that returns the names of the object
 """
 IGNORABLE = (
     *("contact", "self_contact", "torsion", "limit", "ball_limit", "friction", "gravcomp"),
-    "tendon",
+    *("tendon", "fluid"),
     *REFUSED,
 )
 """The values that the argument `ignore` of `from_mjcf` may have."""
@@ -103,6 +96,9 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
         yield "the flag actuation='disable' of a model with actuators"
     if m.opt.disableactuator:
         yield "the option actuatorgroupdisable"
+    if (m.opt.density or m.opt.viscosity) and not compiled.disabled("fluid"):
+        for name in _named(compiled, "geom", m.geom_fluid[:, :1]):
+            yield f"fluidshape of geom '{name}'"
     if m.body_gravcomp.any() and not compiled.disabled("gravcomp"):
         for name in _named(compiled, "joint", m.jnt_actgravcomp * m.jnt_actfrclimited):
             yield f"actuatorgravcomp of joint '{name}' beside an actuatorfrcrange"
