@@ -249,6 +249,37 @@ URDF = """
 """
 
 
+def test_urdf_with_a_mimic_joint():
+    """MuJoCo reads it as an equality of joints: θ = 2 φ + 0.1."""
+    link = '<link name="{}"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.15"'
+    link += ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/>'
+    joint += '<axis xyz="0 1 0"/>{3}</joint>'
+    mimic = '<mimic joint="lead" multiplier="2" offset="0.1"/>'
+    text = "".join(map(link.format, "abc")) + joint.format("lead", "a", "b", "")
+    read = jc.from_mjcf(
+        f'<robot name="arm">{text}{joint.format("follow", "b", "c", mimic)}</robot>'
+    )
+    found = jc.violation(read.system, read.state([0.3, 0.6], [0.5, 1.0])).position
+    np.testing.assert_allclose(found[-1], -0.1, atol=1e-12)
+
+
+def test_mocap_bodies_are_held_if_their_motions_are_left_out():
+    """A link hangs on the mocap body; contacts with it remain, and none between fixed geoms."""
+    held = (
+        '<geom name="floor" size="0.1"/><body name="hand" mocap="true" pos="1 0 2">'
+        f'<geom name="palm" size="0.1"/><body name="finger" pos="0 1 0"><joint/>{BODY}</body></body>'
+        f'<body name="ball"><freejoint/>{BODY}<geom name="skin" size="0.1"/></body>'
+    )
+    m = mujoco.MjModel.from_xml_string(model(held))
+    read, data = jc.from_mjcf(m, ignore=("mocap",)), mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    position = jc.position(read.system, read.start, "finger")
+    np.testing.assert_allclose(position, data.body("finger").xpos, atol=1e-12)
+    names = {name for group in read.system.bounds for name in group.names}
+    assert names == {"floor and skin", "palm and skin"}
+
+
 def test_the_map_to_states_hardly_grows_with_the_model():
     """Links are lanes of arrays and joints are iterations of a loop, so the trace hardly grows."""
     sizes = []
@@ -338,6 +369,10 @@ REFUSED = {
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
 }
+REFUSED["mocap"] = (
+    model(f'<body name="hand" mocap="true"/>{HINGE.format("", "")}'),
+    "motions of the mocap bodies 'hand' are not supported",
+)
 
 
 @pytest.mark.parametrize("key", REFUSED)
@@ -356,7 +391,6 @@ def acting(actuator):
 
 
 UNSUPPORTED = {
-    "mocap body": model(f'<body mocap="true"/>{HINGE.format("", "")}'),
     "trntype 'body'": model(
         HINGE.format("", ""), '<actuator><adhesion name="m" body="b" ctrlrange="0 1"/></actuator>'
     ),

@@ -100,6 +100,14 @@ class Compiled:
         """Returns the name of a value of a MuJoCo enumeration, such as "hinge" for mjtJoint 3."""
         return getattr(self.mujoco, enum)(int(value)).name.split("_", 1)[1].lower()
 
+    def root(self, body: int) -> int:
+        """Returns MuJoCo's id of the first body of the link with a body; 0 if it does not move.
+
+        Mocap bodies are held at their pose in the model.
+        """
+        weld = int(self.model.body_weldid[body])
+        return 0 if self.model.body_mocapid[weld] >= 0 else weld
+
     def disabled(self, *features: str) -> bool:
         """Returns True if `ignored` or a flag of the model disables any of these features."""
         if self.ignored.intersection(features):

@@ -291,6 +291,7 @@ def from_mjcf(
             "contact": all contacts,
             "self_contact": contacts between two moving bodies,
             "shape": contacts between unsupported shapes,
+            "mocap": motions of mocap bodies, which are held at their pose in the model,
             "torsion": torsional and rolling friction (condim 4 or 6),
             "limit": all joint limits,
             "ball_limit": limits of ball joints,

@@ -68,8 +68,7 @@ def _acts(compiled: Compiled, pair: GeomPair) -> bool:
     It needs none if both shapes are in `FLAT`, if both geoms belong to the same link or to the
     world, or if the user ignores contacts between moving bodies ("self_contact").
     """
-    weld, body = compiled.model.body_weldid, compiled.model.geom_bodyid
-    first, second = (int(weld[body[g]]) for g in pair[:2])  # link's first body; 0 for world
+    first, second = (compiled.root(compiled.model.geom_bodyid[g]) for g in pair[:2])
     flat = all(kind in FLAT for kind in shapes(compiled, pair))
     left_out = first and second and "self_contact" in compiled.ignored
     return first != second and not flat and not left_out

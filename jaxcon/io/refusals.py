@@ -31,8 +31,14 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
+def mocap_bodies(compiled: Compiled) -> list[str]:
+    """Returns the names of all mocap bodies."""
+    return _named(compiled, "body", compiled.model.body_mocapid >= 0)
+
+
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
+    "mocap": ("motions of the mocap bodies", mocap_bodies),
 }
 """The unsupported features that `ignore` may leave out.
 
@@ -82,7 +88,7 @@ def refuse(compiled: Compiled) -> None:
 def _unsupported(compiled: Compiled) -> Iterable[str]:
     """Yields descriptions of the unsupported features that `ignore` cannot leave out."""
     m = compiled.model
-    for count, what in (("nflex", "flex"), ("nmocap", "mocap body"), ("nplugin", "plugin")):
+    for count, what in (("nflex", "flex"), ("nplugin", "plugin")):
         if getattr(m, count):
             yield f"a {what}, of which there are {getattr(m, count)},"
     for kind, field, what in ZERO:
