@@ -2,7 +2,7 @@
 
 Joints: Revolute, Prismatic, Spherical, Fixed, Distance, Coincident, Cylindrical, Universal, Planar,
     Screw, ConstantVelocity, RevoluteSpherical, SphericalSpherical, Span, Twist, RotationAngle,
-    Thrust, Tendon, Parallel, PointOnLine, PointOnPlane, PointOnCurve, Compound.
+    Thrust, Tendon, WrappedSpan, Parallel, PointOnLine, PointOnPlane, PointOnCurve, Compound.
 Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, Armature.
 Prescribed motions: Drive.
 Rolling and blades: RollingDisc, RollingSphere, RollingCylinder, KnifeEdge.
@@ -43,6 +43,7 @@ from jaxcon.constraints.pairs import (
 )
 from jaxcon.constraints.rolling import KnifeEdge, RollingCylinder, RollingDisc, RollingSphere
 from jaxcon.constraints.tendons import Tendon
+from jaxcon.constraints.wrapping import WrappedSpan
 from jaxcon.system.coordinates import TurnCounter
 
 
@@ -70,6 +71,7 @@ __all__ = [
     "RotationAngle",
     "Thrust",
     "Tendon",
+    "WrappedSpan",
     "Parallel",
     "PointOnLine",
     "PointOnPlane",

@@ -32,6 +32,8 @@ def bodies(dtype=None, **gravity):
     return scene
 
 
+ENDS = {"point_a": (0.3, 0.3, -0.4), "point_b": (1.3, 0, -0.3)}
+WRAPS = {"sphere": {}, "cylinder": {"axis": (0.2, 1, 0)}}
 ELEMENTS = {
     "angle": [jc.joints.RotationAngle("x", "a", "b")],
     "angle in the world": [jc.joints.RotationAngle("x", jc.WORLD, "b")],
@@ -43,6 +45,13 @@ ELEMENTS = {
         jc.joints.RotationAngle("turn", jc.WORLD, "c"),
         jc.joints.Tendon("x", ("there", "on", "turn"), (1.0, 0.5, -0.3)),
     ],
+    **{
+        f"wrapped {name}": [
+            jc.joints.WrappedSpan("span", "a", "b", "c", 0.3, **ENDS, **given),
+            jc.joints.Tendon("x", ("span",)),
+        ]
+        for name, given in WRAPS.items()
+    },
 }
 
 
@@ -236,3 +245,33 @@ def test_wrong_tendons_are_named(tendon, match):
 def test_a_dead_band_is_not_reversed():
     with pytest.raises(ValueError, match="lower must not be above upper, got 0.2 and 0.1"):
         arm(None, TENDON, jc.forces.DeadBandSpring("s", "tendon", 1.0, 0.2, 0.1))
+
+
+def test_a_span_wraps_around_a_cylinder():
+    """A screw line between two straight lines, by hand; a straight line where it misses."""
+    scene = bodies()
+    given = jc.WORLD, jc.WORLD, "a", 0.3, (0, 0, 0), (0, 0, 1)
+    ends = {"point_a": (0.5, 0.1, 0.0), "point_b": (-0.5, 0.1, 0.4)}
+    scene.add(jc.joints.WrappedSpan("near", *given, **ends))
+    ends = {"point_a": (0.5, 0.4, 0.0), "point_b": (-0.5, 0.4, 0.4)}
+    scene.add(jc.joints.WrappedSpan("far", *given, **ends))
+    params = scene.build()[0].params
+    r = np.hypot(0.5, 0.1)
+    angle = np.pi - 2 * np.arctan(0.2) - 2 * np.arccos(0.3 / r)
+    flat = 2 * np.sqrt(r**2 - 0.09) + 0.3 * angle
+    np.testing.assert_allclose(params["near"]["length"], np.hypot(flat, 0.4), rtol=1e-12)
+    np.testing.assert_allclose(params["far"]["length"], np.hypot(1, 0.4), rtol=1e-12)
+    scene.add(jc.forces.JointSpring("spring", "near", 1.0))
+    with pytest.raises(ValueError, match="'near' has several points on one body; add a Tendon"):
+        scene.build()
+
+
+def test_a_wrapped_span_keeps_its_place_on_a_body_whose_center_moves():
+    """The length of a span is that of the same points in new principal frames."""
+    scene = bodies()
+    scene.add(jc.joints.WrappedSpan("span", "a", "b", "c", 0.3, **ENDS))
+    scene.add(jc.joints.Tendon("x", ("span",)))
+    system, state = scene.build()
+    changed = system.with_params({"c": {"center": jnp.array([0.1, 0.2, 0.3])}})
+    moved = jc.systems.restate(state, system, changed)
+    np.testing.assert_allclose(jc.coordinate(changed, moved, "x"), 0, atol=1e-12)

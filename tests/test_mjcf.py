@@ -268,7 +268,8 @@ def test_mocap_bodies_are_held_if_their_motions_are_left_out():
     """A link hangs on the mocap body; contacts with it remain, and none between fixed geoms."""
     held = (
         '<geom name="floor" size="0.1"/><body name="hand" mocap="true" pos="1 0 2">'
-        f'<geom name="palm" size="0.1"/><body name="finger" pos="0 1 0"><joint/>{BODY}</body></body>'
+        '<geom name="palm" size="0.1"/><body name="finger" pos="0 1 0"><joint/>'
+        f"{BODY}</body></body>"
         f'<body name="ball"><freejoint/>{BODY}<geom name="skin" size="0.1"/></body>'
     )
     m = mujoco.MjModel.from_xml_string(model(held))

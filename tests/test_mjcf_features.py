@@ -424,14 +424,53 @@ def test_tendons_can_be_left_out_and_wrapped_ones_are_named():
     names = jc.from_mjcf(passive, ignore=("tendon",)).system.params
     assert {"rope", "mixed"} <= set(names)  # actuators act on them
     assert not {"rope spring", "pair", "line", "plain"} & set(names)
-    wrapped = (
-        '<tendon><spatial name="w" {}><site site="post"/><geom geom="drum"/><site site="d1"/>'
-        "</spatial></tendon>"
+    sided = (
+        '<tendon><spatial name="w" {}><site site="post"/><geom geom="drum" sidesite="core"/>'
+        '<site site="d1"/></spatial></tendon>'
     )
-    drum = '<geom name="drum" size="0.1" contype="0" conaffinity="0"/>'
+    drum = '<geom name="drum" size="0.1" contype="0" conaffinity="0"/><site name="core"/>'
     sensor = '<sensor><tendonpos name="reach" tendon="w"/></sensor>'
-    with pytest.raises(NotImplementedError, match="tendon 'w' wraps around the geom 'drum'"):
-        jc.from_mjcf(model(STRUNG + drum, wrapped.format('stiffness="1"')))
-    read = jc.from_mjcf(model(STRUNG + drum, wrapped.format("") + sensor))
+    with pytest.raises(
+        NotImplementedError, match="tendon 'w' wraps .* 'drum' on the side of .* 'core'"
+    ):
+        jc.from_mjcf(model(STRUNG + drum, sided.format('stiffness="1"')))
+    read = jc.from_mjcf(model(STRUNG + drum, sided.format("") + sensor))
     with pytest.raises(NotImplementedError, match="'reach' of type tendonpos is of a tendon that"):
         read.sensors(read.start)
+
+
+WRAPPED = (
+    '<site name="post" pos="0.3 0.4 1.2"/><geom name="ball" size="0.3" pos="0.3 0.1 0.6"/>'
+    f'<body name="a" pos="0 0 1"><joint axis="0 1 0"/>{BODY}<site name="a1" pos="0.2 0.1 -0.6"/>'
+    '<geom name="drum" type="cylinder" size="0.15 0.3" pos="0.1 0 -0.3" euler="0.3 0.2 0"/>'
+    f'<body name="b" pos="0 0.1 -0.5"><joint type="ball"/>{SMALL}<site name="b1" pos="0.1 0 -0.3"/>'
+    "</body></body>"
+    f'<body name="d" pos="0.5 0 0"><freejoint/>{SMALL}<site name="d1" pos="0.1 0 0.2"/></body>'
+)
+AROUND = """<tendon>
+<spatial name="one" stiffness="8" springlength="0"><site site="post"/><geom geom="ball"/>
+  <site site="a1"/></spatial>
+<spatial name="two" stiffness="5" springlength="0" damping="0.5"><site site="d1"/>
+  <geom geom="ball"/><site site="b1"/><geom geom="drum"/><site site="post"/></spatial>
+<spatial name="three" stiffness="7" springlength="0"><site site="a1"/>
+  <geom geom="drum"/><site site="d1"/></spatial></tendon>
+<sensor><tendonpos tendon="one"/><tendonpos tendon="two"/><tendonpos tendon="three"/>
+<tendonvel tendon="two"/></sensor>"""
+
+
+def test_wrapped_tendons_are_those_of_mujoco():
+    """Each surface is met in some states and missed in others."""
+    m = model(WRAPPED, AROUND)
+    assert agreement.acceleration_error(m) < AGREE
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    states = agreement.random_states(m, 100)
+    readings = agreement.quick(jax.vmap(lambda q, v: read.sensors(read.state(q, v))))
+    got = readings(*map(jnp.asarray, states[:2]))
+    wrapped = []
+    for i in range(100):
+        data.qpos[:], data.qvel[:] = states.qpos[i], states.qvel[i]
+        mujoco.mj_forward(m, data)
+        np.testing.assert_allclose(got[i], data.sensordata, atol=1e-8)
+        wrapped.append(data.ten_wrapnum > (2, 3, 2))
+    assert np.all(np.any(wrapped, axis=0))
+    assert not np.any(np.all(wrapped, axis=0))

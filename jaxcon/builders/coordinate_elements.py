@@ -193,7 +193,8 @@ class CoordinateElements:
         for column in columns:
             group, joints, _ = zip(*column, strict=True)
             of_joint = self.joints[group[0]].select(joints).places
-            places += [p for p in of_joint if p not in places]
+            for place in of_joint:
+                places += [] if place in places else [place]
             sides.append(tuple(places.index(p) for p in of_joint))
         return tuple(places), tuple(sides)
 
@@ -205,12 +206,19 @@ class CoordinateElements:
             where: the group of each joint and its index in the group, by joint name.
 
         Raises:
-            ValueError: a coordinate is unknown or coupled with itself, or a prescribed or coupled
-                coordinate, or that of a tendon, is not the integral of its rate.
+            ValueError: a coordinate is unknown, used by tendons only, or coupled with itself. Or a
+                prescribed or coupled coordinate, or that of a tendon, is not the integral of its
+                rate.
         """
         ends = tuple(
             find(self.joints, where, label(element), *end) for end in element.joint_coordinates
         )
+        for group, index, _ in ends:
+            if self.joints[group].law.repeats and not isinstance(element, Tendon):
+                raise ValueError(
+                    f"{label(element)}: '{self.joints[group].names[index]}' has several points on"
+                    " one body; add a Tendon over it and act on the tendon."
+                )
         if len(set(ends)) < len(ends):
             raise ValueError(
                 f"{label(element)}: it couples a coordinate with itself:"

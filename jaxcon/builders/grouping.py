@@ -249,7 +249,8 @@ class Gather:
                 known = [WORLD, *self.layout.bodies, *self.layout.fixed]
                 raise ValueError(f"{owner}: body {name!r} is unknown; known are {known}.")
         moving = [name for name in names if name in self.layout.places]
-        if len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]:
+        repeated = len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]
+        if repeated and not element.repeats:
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
         if not moving:
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")

@@ -263,8 +263,8 @@ def from_mjcf(
     adds a force and a torque that turn with the site.
 
     Tendons become a `jc.joints.Tendon`: over joints, or over a `jc.joints.Span` for each segment
-    between sites. Tendons that wrap around geoms are not supported. Their springs, dampers, ranges,
-    friction and rotors are those of joints.
+    between sites. Segments that wrap around spheres and cylinders are a `jc.joints.WrappedSpan`,
+    which takes the shorter way; sidesite is not supported.
 
     Ranges of hinges and slides become `jc.contacts.Limit`. Ranges of ball joints limit a
     `jc.joints.RotationAngle`. The attribute frictionloss becomes

@@ -1,7 +1,7 @@
 """Import of MuJoCo's tendons: over joints (fixed), and through sites and pulleys (spatial).
 
-A spatial tendon is the sum of a `Span` for each segment between sites of different links, divided
-by the divisor of the last pulley.
+A spatial tendon is the sum of a `Span` or `WrappedSpan` for each segment between sites of different
+links, divided by the divisor of the last pulley.
 """
 
 from __future__ import annotations
@@ -14,16 +14,15 @@ import numpy as np
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.pairs import Span
 from jaxcon.constraints.tendons import Tendon
+from jaxcon.constraints.wrapping import WrappedSpan
 from jaxcon.contact.limits import JointFriction, Limit
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate
 from jaxcon.io.links import Link, scene_body
 from jaxcon.system.actuators import DeadBandSpring, JointDamper, JointSpring
 
-Element: TypeAlias = (
-    Span | Tendon | JointSpring | DeadBandSpring | JointDamper | Armature | JointFriction | Limit
-)
-"""A scene element: a tendon, one of its spans, or a passive element on a tendon."""
+Element: TypeAlias = JointSpring | DeadBandSpring | JointDamper | Armature | JointFriction | Limit
+"""A passive element on a tendon."""
 
 
 class Tendons(NamedTuple):
@@ -34,7 +33,7 @@ class Tendons(NamedTuple):
         coordinates: the scene coordinate of each imported tendon, by MuJoCo's tendon id.
     """
 
-    elements: list[Span | Tendon]
+    elements: list[Span | WrappedSpan | Tendon]
     coordinates: dict[int, Coordinate]
 
 
@@ -50,8 +49,8 @@ def tendons(
         names: the names in the scene.
 
     Raises:
-        NotImplementedError: a tendon that affects the motion wraps around a geom, or cannot change
-            its length.
+        NotImplementedError: a tendon that affects the motion has a sidesite, or cannot change its
+            length.
     """
     found = Tendons([], {})
     acting, read = _acting(compiled), _read(compiled)
@@ -127,51 +126,83 @@ def _spatial(compiled: Compiled, t: int) -> bool:
     return _wraps(compiled, t)[0][0] != "joint"
 
 
+class Segment(NamedTuple):
+    """A segment of a spatial tendon between two sites.
+
+    Attributes:
+        first, second: MuJoCo's ids of the sites.
+        factor: the factor of its length, the inverse divisor of the last pulley.
+        geom: MuJoCo's id of the geom around which it wraps; −1 for none.
+        side: MuJoCo's id of the site on whose side it passes the geom; −1 for none.
+    """
+
+    first: int
+    second: int
+    factor: float
+    geom: int = -1
+    side: int = -1
+
+
 def unsupported(compiled: Compiled, links: tuple[Link, ...], t: int) -> str:
     """Returns why a tendon is not supported; empty if it is."""
-    path = _wraps(compiled, t)
-    for kind, i, _ in path:
-        if kind in ("sphere", "cylinder"):
-            return f"wraps around the geom '{compiled.name('geom', i)}', which is not supported"
-    if _spatial(compiled, t) and not _segments(compiled, links, t):
-        return "lies in one body and cannot change its length; remove it"
-    return ""
+    if not _spatial(compiled, t):
+        return ""
+    segments = _segments(compiled, links, t)
+    for x in segments:
+        if x.side >= 0:
+            return (
+                f"wraps around the geom '{compiled.name('geom', x.geom)}' on the side of the site"
+                f" '{compiled.name('site', x.side)}'; wrapping is supported without sidesite"
+            )
+    return "" if segments else "lies in one body and cannot change its length; remove it"
 
 
-def _segments(compiled: Compiled, links: tuple[Link, ...], t: int) -> list[tuple[int, int, float]]:
-    """Returns the segments of a spatial tendon that may change their length.
-
-    Returns:
-        For each segment between sites of different links, MuJoCo's ids of both sites, and the
-        factor of its length.
-    """
-    m, factor, before = compiled.model, 1.0, -1
+def _segments(compiled: Compiled, links: tuple[Link, ...], t: int) -> list[Segment]:
+    """Returns the segments of a spatial tendon that may change their length."""
+    m, factor, before, geom, side = compiled.model, 1.0, -1, -1, -1
     found = []
-    for kind, site, parameter in _wraps(compiled, t):
+    for kind, i, parameter in _wraps(compiled, t):
         if kind == "pulley":
             factor, before = 1 / parameter, -1
-            continue
-        if before >= 0:
-            ends = [scene_body(compiled, links, int(m.site_bodyid[s])) for s in (before, site)]
-            if ends[0] != ends[1]:
-                found.append((before, site, factor))
-        before = site
+        elif kind in ("sphere", "cylinder"):
+            geom, side = i, int(round(parameter))
+        else:
+            if before >= 0:
+                owners = [m.site_bodyid[before], m.site_bodyid[i]]
+                owners += [m.geom_bodyid[geom]] if geom >= 0 else []
+                if len({scene_body(compiled, links, int(b)) for b in owners}) > 1:
+                    found.append(Segment(before, i, factor, geom, side if geom >= 0 else -1))
+            before, geom, side = i, -1, -1
     return found
 
 
-Term: TypeAlias = tuple[Span | None, Coordinate, float]
+Term: TypeAlias = tuple[Span | WrappedSpan | None, Coordinate, float]
 """A term of a tendon: its span, if it is new; the coordinate; and the coefficient."""
 
 
 def _spans(compiled: Compiled, links: tuple[Link, ...], t: int, names: Names) -> list[Term]:
-    """Returns the terms of a tendon through sites, with a `Span` for each segment."""
+    """Returns the terms of a tendon through sites, with a span for each segment."""
     m, data, terms = compiled.model, compiled.data, []
-    for first, second, factor in _segments(compiled, links, t):
-        sites = first, second
-        bodies = [scene_body(compiled, links, int(m.site_bodyid[s])) for s in sites]
-        points = [data.site_xpos[s] for s in sites]
+    for segment in _segments(compiled, links, t):
+        first, second, factor, geom, _ = segment
+        start, end = data.site_xpos[first], data.site_xpos[second]
+        bodies = [scene_body(compiled, links, int(m.site_bodyid[s])) for s in (first, second)]
         name = names.take(f"{compiled.name('tendon', t)} span", "span")
-        span = Span(name, *bodies, *points)
+        if geom < 0:
+            span = Span(name, bodies[0], bodies[1], start, end)
+        else:
+            round_axis = compiled.choice("mjtGeom", m.geom_type[geom]) == "cylinder"
+            span = WrappedSpan(
+                name,
+                bodies[0],
+                bodies[1],
+                scene_body(compiled, links, int(m.geom_bodyid[geom])),
+                m.geom_size[geom, 0],
+                center=data.geom_xpos[geom],
+                axis=data.geom_xmat[geom].reshape(3, 3)[:, 2] if round_axis else None,
+                point_a=start,
+                point_b=end,
+            )
         terms.append((span, Coordinate(name, "stretch"), factor))
     return terms
 
