@@ -1,7 +1,7 @@
 """Springs, dampers, actuators and applied forces.
 
 Springs and dampers: Spring, JointSpring, DeadBandSpring, JointDamper, Bending, Flexure.
-Actuators: Motor, PositionServo, VelocityServo, AffineActuator.
+Actuators: Motor, PositionServo, VelocityServo, AffineActuator, Muscle.
 Applied forces: ExternalWrench, CustomForce, Force, FluidDrag.
 """
 
@@ -11,6 +11,7 @@ from jaxcon.system.actuators import (
     JointDamper,
     JointSpring,
     Motor,
+    Muscle,
     PositionServo,
     VelocityServo,
 )
@@ -35,6 +36,7 @@ __all__ = [
     "PositionServo",
     "VelocityServo",
     "AffineActuator",
+    "Muscle",
     "ExternalWrench",
     "CustomForce",
     "Force",

@@ -410,8 +410,9 @@ UNSUPPORTED = {
         HINGE.format("", '<site name="s" axisangle="0 0 1 0.4"/>') + '<site name="t"/>',
         '<actuator><position site="s" refsite="t" gear="0 0 0 0 0 1" kp="1"/></actuator>',
     ),
-    "dyntype 'filter'": acting('<general joint="turn" dyntype="filter" dynprm="1"/>'),
-    "biastype 'muscle'": acting(
+    "dyntype 'user'": acting('<general joint="turn" dyntype="user" actdim="1"/>'),
+    "has 2 activations": acting('<general joint="turn" dyntype="user" actdim="2"/>'),
+    "gaintype 'fixed' and the biastype 'muscle'; a muscle needs both": acting(
         '<general joint="turn" biastype="muscle" biasprm="0.75 1.05 1 200 0.5 1.6 1.5 1.3 1.2"'
         ' lengthrange="0 1"/>'
     ),

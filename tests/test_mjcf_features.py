@@ -474,3 +474,69 @@ def test_wrapped_tendons_are_those_of_mujoco():
         wrapped.append(data.ten_wrapnum > (2, 3, 2))
     assert np.all(np.any(wrapped, axis=0))
     assert not np.any(np.all(wrapped, axis=0))
+
+
+ACTIVATED = """<actuator>
+<general name="slow" joint="ja" dyntype="filter" dynprm="0.3" gainprm="2" ctrlrange="-1 1"/>
+<general name="exact" joint="jb" dyntype="filterexact" dynprm="0.01" gaintype="affine"
+  gainprm="2 0.3 0.1" biastype="affine" biasprm="0.2 -1 -0.3" gear="1.5" forcerange="-3 3"/>
+<motor name="plain" joint="jc" ctrlrange="-0.5 0.5"/>
+<general name="sum" joint="jc" dyntype="integrator" gainprm="3" actlimited="true"
+  actrange="-0.1 0.1" actearly="true"/>
+<muscle name="biceps" tendon="rope" lengthrange="1 4" force="90" ctrlrange="0 1" gear="0.9"/>
+<muscle name="soft" joint="ja" lengthrange="-1 2" scale="40" tausmooth="0.3" range="0.5 1.1"/>
+<general name="direct" joint="jb" gaintype="muscle" biastype="muscle" lengthrange="-2 1"
+  gainprm="0.7 1.2 60 200 0.5 1.6 1.5 1.3 1.2" biasprm="0.7 1.2 60 200 0.5 1.6 1.5 0.9 1.2"/>
+</actuator>"""
+
+
+def test_activations_and_muscles_are_those_of_mujoco():
+    """Accelerations at given activations, and activations after a step of MuJoCo's Euler."""
+    m = model(STRUNG, TENDONS.format("", "", "") + ACTIVATED)
+    m.opt.timestep = 0.02
+    read, data, count = jc.from_mjcf(m), mujoco.MjData(m), 100
+    states, random = agreement.random_states(m, count), np.random.default_rng(1)
+    ctrl, act = random.uniform(-1.5, 1.5, (count, m.nu)), random.uniform(0, 1, (count, m.na))
+
+    def accelerate(qpos, qvel, ctrl, act):
+        after, control = read.activate(act, ctrl)
+        state = read.state(qpos, qvel)
+        solution = jc.forward_dynamics(read.system, state, control, agreement.EXACT, 1e-3)
+        return read.qacc(state, solution.acceleration), after
+
+    given = map(jnp.asarray, (*states[:2], ctrl, act))
+    got, after = agreement.quick(jax.vmap(accelerate))(*given)
+    for i in range(count):
+        mujoco.mj_resetData(m, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:], data.act[:] = (
+            *(x[i] for x in states[:2]),
+            ctrl[i],
+            act[i],
+        )
+        mujoco.mj_forward(m, data)
+        assert agreement.relative(np.asarray(got[i])[None], data.qacc[None].copy()) < AGREE
+        mujoco.mj_step(m, data)
+        np.testing.assert_allclose(after[i], data.act, atol=1e-12)
+    np.testing.assert_array_equal(read.activation, np.zeros(m.na))
+    plain = jc.from_mjcf(model(STRUNG))
+    assert plain.activate(plain.activation, jnp.zeros(0))[0].shape == (0,)
+
+
+def test_activations_have_gradients_and_keyframes():
+    key = '<keyframe><key name="k" act="0.2 0.3 0.05 0.4 0.5" ctrl="1 1 1 1 1 1 1"/></keyframe>'
+    text = TENDONS.format("", "", "") + ACTIVATED + key
+    read = jc.from_mjcf(model(STRUNG, text), dtype=jnp.float32)
+    start = read.keyframe("k")
+
+    def last(ctrl):
+        def step(act, _):
+            return read.activate(act, ctrl, 0.01)[0], None
+
+        return jax.lax.scan(step, start.activation, None, 20)[0]
+
+    slope = jax.jit(jax.jacrev(last))(0.5 * start.control)
+    assert slope.dtype == jnp.float32
+    acting = np.array([0, 1, 3, 4, 5])
+    np.testing.assert_array_equal(np.diag(np.asarray(slope)[:, acting]) != 0, [1, 1, 0, 1, 1])
+    with pytest.raises(ValueError, match="activation must have shape \\(5,\\), got \\(4,\\)"):
+        read.activate(jnp.zeros(4, jnp.float32), start.control)

@@ -1,15 +1,15 @@
 """Spans that wrap around a sphere or a cylinder of a third body.
 
 In the frame of the surface, the ends x₀ and x₁ of a span are projected to a plane: normal to the
-cylinder, or through both ends and the center of the sphere. They lie at distances r₀ and r₁ from the
-center of a circle of radius R, with the angle θ between them. The length in the plane is
+cylinder, or through both ends and the center of the sphere. They lie at distances r₀ and r₁ from
+the center of a circle of radius R, with the angle θ between them. The length in the plane is
 
     L = √(r₀² − R²) + R γ + √(r₁² − R²),   γ = θ − arccos R/r₀ − arccos R/r₁,
 
 where γ is the angle of the arc on which the span touches the circle. Along a cylinder the length is
-ℓ = √(L² + Δz²), since the shortest path is straight on the unrolled surface. The gradient of ℓ by x₀
-is minus the unit vector along the span at x₀. If γ < 0, the straight line misses the circle, and the
-span is straight.
+ℓ = √(L² + Δz²), since the shortest path is straight on the unrolled surface. The gradient of ℓ by
+x₀ is minus the unit vector along the span at x₀. If γ < 0, the straight line misses the circle, and
+the span is straight.
 """
 
 from __future__ import annotations

@@ -10,10 +10,11 @@ from jaxcon.constraints.compound import Compound
 from jaxcon.constraints.measures import Thrust
 from jaxcon.constraints.pairs import Twist
 from jaxcon.core import checks
+from jaxcon.io.activations import DYNAMIC, SHORTEST
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, Ends, pushing, turning
 from jaxcon.io.links import Link, LinkJoint, scene_body
-from jaxcon.system.actuators import AffineActuator, Motor
+from jaxcon.system.actuators import AffineActuator, Motor, Muscle
 from jaxcon.system.layout import WORLD
 
 
@@ -36,9 +37,9 @@ class Transmission(NamedTuple):
 
 LAWS = (
     ("trntype", "mjtTrn", ("joint", "jointinparent", "tendon", "site")),
-    ("dyntype", "mjtDyn", ("none",)),
-    ("gaintype", "mjtGain", ("fixed", "affine")),
-    ("biastype", "mjtBias", ("none", "affine")),
+    ("dyntype", "mjtDyn", ("none", *DYNAMIC)),
+    ("gaintype", "mjtGain", ("fixed", "affine", "muscle")),
+    ("biastype", "mjtBias", ("none", "affine", "muscle")),
 )
 """The supported types of transmission, dynamics, gain and bias.
 
@@ -48,7 +49,7 @@ Each entry has MuJoCo's field, its enumeration, and the names of the supported v
 ALIGNED = 1e-9
 """The largest angle [rad] between a site and its reference site that count as aligned."""
 
-Element: TypeAlias = Motor | AffineActuator | Compound | Twist | Thrust
+Element: TypeAlias = Motor | AffineActuator | Muscle | Compound | Twist | Thrust
 """A scene element: an actuator, or a joint without constraint rows.
 
 Such a joint defines the coordinate on which an actuator acts.
@@ -128,41 +129,112 @@ def _check(compiled: Compiled, i: int) -> None:
     """Checks that an actuator has supported types of transmission, dynamics, gain and bias.
 
     Raises:
-        NotImplementedError: a type is not supported.
+        NotImplementedError: a type is not supported, or only one of gain and bias is a muscle.
     """
     m = compiled.model
+    label = compiled.name("actuator", i)
+    if (count := int(m.actuator_actnum[i])) > 1:
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{label}' has {count} activations; supported is one."
+        )
     for field, enum, supported in LAWS:
         kind = compiled.choice(enum, getattr(m, f"actuator_{field}")[i])
         if kind not in supported:
             raise NotImplementedError(
-                f"from_mjcf: actuator '{compiled.name('actuator', i)}' has the {field} '{kind}';"
+                f"from_mjcf: actuator '{label}' has the {field} '{kind}';"
                 f" supported are {list(supported)}."
             )
+    laws = (
+        compiled.choice("mjtGain", m.actuator_gaintype[i]),
+        compiled.choice("mjtBias", m.actuator_biastype[i]),
+    )
+    if "muscle" in laws and laws != ("muscle", "muscle"):
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{label}' has the gaintype '{laws[0]}' and the biastype"
+            f" '{laws[1]}'; a muscle needs both."
+        )
 
 
 def _law(
     compiled: Compiled, i: int, name: str, transmission: Transmission
-) -> Motor | AffineActuator:
+) -> Motor | AffineActuator | Muscle:
     """Builds actuator i with MuJoCo's force law (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇.
 
     u is the control, l = g (θ + reference) the actuator length with the gear ratio g, g_i the gain
     parameters and b_i the bias parameters. The result is a `Motor` if the force is proportional to
-    u and has no limits.
+    u and has no limits. Muscles have a law of their own.
     """
     at, gear, reference, measured = transmission
     m = compiled.model
+    # the input of an actuator with an activation is the activation, which has another range
+    acts = compiled.choice("mjtDyn", m.actuator_dyntype[i]) != "none"
+    clamped = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl") and not acts
+    control = m.actuator_ctrlrange[i] if clamped else None
+    force = _force_range(compiled, i, gear)
+    if compiled.choice("mjtGain", m.actuator_gaintype[i]) == "muscle":
+        length = gear * reference * measured
+        return _muscle(compiled, i, name, at, (gear, length), control, force)
     gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
     gain[1:] *= compiled.choice("mjtGain", m.actuator_gaintype[i]) == "affine"
     bias *= compiled.choice("mjtBias", m.actuator_biastype[i]) == "affine"
     for law in (gain, bias):
         law[0] += law[1] * gear * reference
         law[1] *= measured
-    clamped = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
-    control = m.actuator_ctrlrange[i] if clamped else None
-    force = _force_range(compiled, i, gear)
     if not gain[1:].any() and not bias.any() and force is None:
         return Motor(name, at.joint, gear * gain[0], control, at.name)
     return AffineActuator(name, at.joint, gain, bias, gear, control, force, at.name)
+
+
+def _muscle(
+    compiled: Compiled,
+    i: int,
+    name: str,
+    at: Coordinate,
+    lever: tuple[float, float],
+    control: np.ndarray | None,
+    force: np.ndarray | None,
+) -> Muscle:
+    """Builds actuator i as a muscle.
+
+    Args:
+        compiled: the model.
+        i: MuJoCo's id of the actuator.
+        name: the name of the element.
+        at: the coordinate on which the muscle acts.
+        lever: the gear ratio, and the length of the actuator at assembly.
+        control: the range of the activation.
+        force: the range of the force.
+
+    Raises:
+        NotImplementedError: gain and bias have different parameters.
+    """
+    m, parameters = compiled.model, compiled.model.actuator_gainprm[i, :9]
+    passive = m.actuator_biasprm[i, :9]
+    if np.any(parameters[[0, 1, 2, 3, 5]] != passive[[0, 1, 2, 3, 5]]):
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{compiled.name('actuator', i)}' has different muscle parameters"
+            " in gainprm and biasprm, which is not supported."
+        )
+    low, high, largest, scale, shortest, longest, fastest, _, lengthening = parameters
+    if largest < 0:
+        largest = scale / max(m.actuator_acc0[i], SHORTEST)
+    return Muscle(
+        name,
+        at.joint,
+        largest,
+        lever[1],
+        m.actuator_lengthrange[i],
+        (low, high),
+        shortest,
+        longest,
+        fastest,
+        passive[7],
+        lengthening,
+        lever[0],
+        control,
+        force,
+        at.name,
+    )
 
 
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:

@@ -17,6 +17,7 @@ from jaxcon.core.summary import listed, span, table
 from jaxcon.core.typing import Array, DType, Scalar
 from jaxcon.execution.step import SolutionAt
 from jaxcon.io import maps
+from jaxcon.io.activations import Activations, activations
 from jaxcon.io.actuators import Transmission, actuators
 from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
@@ -45,10 +46,12 @@ class Keyframe:
     Attributes:
         state: the state of the system.
         control: MuJoCo's ctrl, (nu,).
+        activation: MuJoCo's act, (na,).
     """
 
     state: State
     control: Array
+    activation: Array
 
 
 @pytree
@@ -56,7 +59,8 @@ class MujocoModel:
     """An imported MuJoCo model: a system, and conversions to and from MuJoCo's coordinates.
 
     `system, state = model` unpacks the system and its initial state, as `jc.Scene.build` returns
-    them. `model.method()` is a suitable `jc.Method`. The control array is MuJoCo's ctrl.
+    them. `model.method()` is a suitable `jc.Method`. The control array is MuJoCo's ctrl, with the
+    activations of filters, integrators and muscles in place of their controls; see `activate`.
 
     Attributes:
         system: the system. Links, joints and actuators have MuJoCo's names. If an object of another
@@ -64,8 +68,9 @@ class MujocoModel:
         start: the state in MuJoCo's reference pose, at rest.
         timestep: the step size in the model's options, () [s].
         tree: the kinematic tree in MuJoCo's coordinates.
-        keys: time, qpos, qvel and ctrl of each keyframe.
+        keys: time, qpos, qvel, ctrl and act of each keyframe.
         readings: the sensors; `sensors` reads them.
+        activations: the dynamics of the activations; `activate` advances them.
         joints: for each hinge and slide, its name in MuJoCo, and its coordinate in the system.
         keyframes: the names of the keyframes; "key 0" and so on for keyframes without a name.
     """
@@ -76,6 +81,7 @@ class MujocoModel:
     tree: Tree
     keys: tuple[dict[str, Array], ...]
     readings: Sensors
+    activations: Activations
     joints: tuple[tuple[str, Coordinate], ...] = static()
     keyframes: tuple[str, ...] = static()
 
@@ -183,6 +189,39 @@ class MujocoModel:
         return jax.jvp(qvel, (state.q, state.v), slopes)[1]
 
     @property
+    def activation(self) -> Array:
+        """MuJoCo's act at the start, (na,): zeros."""
+        return jnp.zeros(len(self.activations.kinds), self.start.q.dtype)
+
+    def activate(
+        self, activation: Array, control: Array, dt: Scalar | None = None
+    ) -> tuple[Array, Array]:
+        """Advances the activations of filters, integrators and muscles by a step.
+
+        The control of the system has the activations in place of the controls of these actuators.
+        A step of a model with activations is
+
+            act, control = model.activate(act, ctrl, dt)
+            state, info = jc.step(model.system, method, state, control, dt)
+
+        as in MuJoCo's Euler integrator. Begin with act = `model.activation`.
+
+        Args:
+            activation: MuJoCo's act, (na,).
+            control: MuJoCo's ctrl, (nu,).
+            dt: the step size h, () [s]; `timestep` by default.
+
+        Returns:
+            The activations after the step, (na,), and the control of the system, (nu,).
+        """
+        dtype, count = self.start.q.dtype, len(self.activations.kinds)
+        act = checks.real("activate", "activation", activation, dtype, (count,))
+        n_u = self.system.layout.n_u
+        ctrl = checks.real("activate", "control", control, dtype, (n_u,))
+        h = self.timestep if dt is None else checks.real("activate", "dt", dt, dtype)
+        return self.activations.advance(act, ctrl, h)
+
+    @property
     def sensor_slices(self) -> dict[str, slice]:
         """The slice of each sensor in MuJoCo's sensordata, by name."""
         return {x.name: slice(x.start, x.start + x.size) for x in self.readings.entries}
@@ -205,7 +244,7 @@ class MujocoModel:
             state: the state of one world.
             info: the info of a step, or the result of `jc.forward_dynamics`. Models without these
                 sensors need none.
-            control: MuJoCo's ctrl, (nu,); by default the control of the info.
+            control: the control of the system, (nu,); by default the control of the info.
             names: the sensors to read, in the order of the result; by default all. Sensors without
                 a name are called "sensor 0" and so on.
 
@@ -236,7 +275,8 @@ class MujocoModel:
         if name not in self.keyframes:
             raise ValueError(f"keyframe '{name}' is unknown; known are {list(self.keyframes)}.")
         key = self.keys[self.keyframes.index(name)]
-        return Keyframe(self.state(key["qpos"], key["qvel"], key["time"]), key["ctrl"])
+        state = self.state(key["qpos"], key["qvel"], key["time"])
+        return Keyframe(state, key["ctrl"], key["act"])
 
 
 def from_mjcf(
@@ -259,8 +299,9 @@ def from_mjcf(
     The method `sensors` of the model reads its sensors. Features without effect on the motion, such
     as cameras, are dropped. Unsupported features with an effect raise an error that names them.
 
-    Actuators act on joints, or at sites: without a reference site as a `jc.joints.Thrust`, which
-    adds a force and a torque that turn with the site.
+    Actuators act on joints and tendons, or at sites: without a reference site as a `jc.joints.Thrust`, which
+    adds a force and a torque that turn with the site. Muscles become a `jc.forces.Muscle`. The
+    method `activate` of the model advances the activations of filters, integrators and muscles.
 
     Tendons become a `jc.joints.Tendon`: over joints, or over a `jc.joints.Span` for each segment
     between sites. Segments that wrap around spheres and cylinders are a `jc.joints.WrappedSpan`,
@@ -332,7 +373,7 @@ def from_mjcf(
         return jnp.asarray(x, scene.dtype)
 
     keys = [
-        {"time": m.key_time[i], "qpos": m.key_qpos[i], "qvel": m.key_qvel[i], "ctrl": m.key_ctrl[i]}
+        {x: getattr(m, f"key_{x}")[i] for x in ("time", "qpos", "qvel", "ctrl", "act")}
         for i in range(m.nkey)
     ]
     timestep = checks.check("from_mjcf", "timestep of the option", m.opt.timestep, (), above=0)
@@ -343,6 +384,7 @@ def from_mjcf(
         _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
         sensors,
+        activations(compiled, scene.dtype),
         tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),
         tuple(compiled.name("key", i) for i in range(m.nkey)),
     )
