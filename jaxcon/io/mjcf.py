@@ -299,9 +299,10 @@ def from_mjcf(
     The method `sensors` of the model reads its sensors. Features without effect on the motion, such
     as cameras, are dropped. Unsupported features with an effect raise an error that names them.
 
-    Actuators act on joints and tendons, or at sites: without a reference site as a `jc.joints.Thrust`, which
-    adds a force and a torque that turn with the site. Muscles become a `jc.forces.Muscle`. The
-    method `activate` of the model advances the activations of filters, integrators and muscles.
+    Actuators act on joints and tendons, or at sites: without a reference site as a
+    `jc.joints.Thrust`, which adds a force and a torque that turn with the site. Muscles become a
+    `jc.forces.Muscle`. The method `activate` of the model advances the activations of filters,
+    integrators and muscles.
 
     Tendons become a `jc.joints.Tendon`: over joints, or over a `jc.joints.Span` for each segment
     between sites. Segments that wrap around spheres and cylinders are a `jc.joints.WrappedSpan`,
