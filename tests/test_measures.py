@@ -233,7 +233,7 @@ def test_tendons_of_one_kind_share_their_code():
         (jc.joints.Tendon("t", ()), "joints must be a tuple with at least one name, got \\(\\)"),
         (jc.joints.Tendon("t", ("nothing",)), "joint 'nothing' is unknown"),
         (jc.joints.Tendon("t", ("hinge 0",), (1, 2)), "coefficients must have shape \\(1,\\)"),
-        (jc.joints.Tendon("t", ("hinge 0",), (1,), ("a", "b")), "coordinates must be 1 names"),
+        (jc.joints.Tendon("t", ("hinge 0",), (1,), ("a", "b")), "coordinate_names must be 1 names"),
         (jc.joints.Tendon("t", ("hinge 0",) * 2), "couples a coordinate with itself"),
     ],
 )

@@ -10,7 +10,7 @@ from jaxcon.constraints.armature import Armature, Armatures
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Coupling, Couplings
 from jaxcon.constraints.drive import Drive, Drives
-from jaxcon.constraints.tendons import Tendon, TendonLaw, Tendons
+from jaxcon.constraints.tendons import Tendon, Tendons
 from jaxcon.contact.limits import Bounds
 from jaxcon.core import checks
 from jaxcon.core.typing import DType, PyTree
@@ -78,7 +78,7 @@ class CoordinateElements:
     def _tendons(self, tendons: list[Tendon]) -> list[Tendons]:
         """Returns the groups of tendons, without the counters of their coordinates."""
         return [
-            Tendons(params, names, places, TendonLaw, terms=terms, sides=sides)
+            Tendons(params, names, places, Tendon, terms=terms, sides=sides)
             for (params, names, places, _), terms, sides, _ in self._gather(tendons)
         ]
 

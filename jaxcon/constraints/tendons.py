@@ -50,28 +50,31 @@ class Tendon(OnCoordinates):
         name: name of the element, unique in the scene.
         joints: names of the joints with the coordinates θᵢ, k of them.
         coefficients: cᵢ, (k,) [m/rad] for angles, without unit for travels; 1 unless given.
-        coordinates: names of the coordinates, k of them; None for a joint with only one.
+        coordinate_names: names of the coordinates, k of them; None for a joint with only one.
     """
 
     name: str
     joints: tuple[str, ...]
     coefficients: Any = None
-    coordinates: tuple[str | None, ...] | None = None
+    coordinate_names: tuple[str | None, ...] | None = None
+    coordinates: ClassVar[Mapping[str, str]] = MappingProxyType({"length": "m"})
+    relative: ClassVar[bool] = True
 
     @property
     def joint_coordinates(self) -> tuple[tuple[str, str | None], ...]:
         """The names of the joints, each with the name of its coordinate."""
-        for field in ("joints", "coordinates"):
+        for field in ("joints", "coordinate_names"):
             given = getattr(self, field)
             if not (isinstance(given, tuple | list) and given) and given is not None:
                 raise ValueError(
                     f"{label(self)}: {field} must be a tuple with at least one name, got {given!r}."
                 )
-        names = (None,) * len(self.joints) if self.coordinates is None else self.coordinates
+        names = self.coordinate_names
+        names = (None,) * len(self.joints) if names is None else names
         if len(names) != len(self.joints):
             raise ValueError(
-                f"{label(self)}: coordinates must be {len(self.joints)} names, one for each joint,"
-                f" got {len(names)}."
+                f"{label(self)}: coordinate_names must be {len(self.joints)} names, one for each"
+                f" joint, got {len(names)}."
             )
         return tuple(zip(self.joints, names, strict=True))
 
@@ -85,13 +88,6 @@ class Tendon(OnCoordinates):
         given = np.ones(count) if self.coefficients is None else self.coefficients
         shape = (count,)
         return {"coefficients": checks.real(label(self), "coefficients", given, dtype, shape)}
-
-
-class TendonLaw(Tendon):
-    """The class of a group of tendons: its coordinate, by which elements find it."""
-
-    coordinates: ClassVar[Mapping[str, str]] = MappingProxyType({"length": "m"})  # type: ignore[assignment]
-    relative: ClassVar[bool] = True
 
 
 @pytree

@@ -183,11 +183,11 @@ Term: TypeAlias = tuple[Span | WrappedSpan | None, Coordinate, float]
 def _spans(compiled: Compiled, links: tuple[Link, ...], t: int, names: Names) -> list[Term]:
     """Returns the terms of a tendon through sites, with a span for each segment."""
     m, data, terms = compiled.model, compiled.data, []
-    for segment in _segments(compiled, links, t):
+    for k, segment in enumerate(_segments(compiled, links, t), 1):
         first, second, factor, geom, _ = segment
         start, end = data.site_xpos[first], data.site_xpos[second]
         bodies = [scene_body(compiled, links, int(m.site_bodyid[s])) for s in (first, second)]
-        name = names.take(f"{compiled.name('tendon', t)} span", "span")
+        name = names.take(f"{compiled.name('tendon', t)} span {k}", "span")
         if geom < 0:
             span = Span(name, bodies[0], bodies[1], start, end)
         else:
