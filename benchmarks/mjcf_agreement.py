@@ -36,6 +36,7 @@ MODELS = (
     "point",
     "pusher",
     "reacher",
+    "swimmer",
     "walker2d",
 )
 ACCELERATION, TRAJECTORY = 1e-8, 1e-6

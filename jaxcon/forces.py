@@ -1,19 +1,22 @@
 """Springs, dampers, actuators and applied forces.
 
-Springs and dampers: Spring, JointSpring, JointDamper, Bending, Flexure.
-Actuators: Motor, PositionServo, VelocityServo, AffineActuator.
-Applied forces: ExternalWrench, CustomForce, Force.
+Springs and dampers: Spring, JointSpring, DeadBandSpring, JointDamper, Bending, Flexure.
+Actuators: Motor, PositionServo, VelocityServo, AffineActuator, Muscle.
+Applied forces: ExternalWrench, CustomForce, Force, FluidDrag.
 """
 
 from jaxcon.system.actuators import (
     AffineActuator,
+    DeadBandSpring,
     JointDamper,
     JointSpring,
     Motor,
+    Muscle,
     PositionServo,
     VelocityServo,
 )
 from jaxcon.system.elastic import Bending, Flexure
+from jaxcon.system.fluid import FluidDrag
 from jaxcon.system.forces import CustomForce, ExternalWrench, Force, Spring
 
 
@@ -25,6 +28,7 @@ def __dir__() -> list[str]:
 __all__ = [
     "Spring",
     "JointSpring",
+    "DeadBandSpring",
     "JointDamper",
     "Bending",
     "Flexure",
@@ -32,7 +36,9 @@ __all__ = [
     "PositionServo",
     "VelocityServo",
     "AffineActuator",
+    "Muscle",
     "ExternalWrench",
     "CustomForce",
     "Force",
+    "FluidDrag",
 ]

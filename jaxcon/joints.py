@@ -1,8 +1,8 @@
 """Joints and other equality constraints.
 
 Joints: Revolute, Prismatic, Spherical, Fixed, Distance, Coincident, Cylindrical, Universal, Planar,
-    Screw, ConstantVelocity, RevoluteSpherical, SphericalSpherical, Span, Twist, Parallel,
-    PointOnLine, PointOnPlane, PointOnCurve, Compound.
+    Screw, ConstantVelocity, RevoluteSpherical, SphericalSpherical, Span, Twist, RotationAngle,
+    Thrust, Tendon, WrappedSpan, Parallel, PointOnLine, PointOnPlane, PointOnCurve, Compound.
 Couplings: Gear, Belt, RackAndPinion, Pulley, Differential, PolynomialCoupling, Armature.
 Prescribed motions: Drive.
 Rolling and blades: RollingDisc, RollingSphere, RollingCylinder, KnifeEdge.
@@ -25,6 +25,7 @@ from jaxcon.constraints.curves import PointOnCurve
 from jaxcon.constraints.custom import Holonomic, VelocityLevel
 from jaxcon.constraints.drive import Drive
 from jaxcon.constraints.joints import Coincident, Distance, Fixed, Prismatic, Revolute, Spherical
+from jaxcon.constraints.measures import RotationAngle, Thrust
 from jaxcon.constraints.momentum import AngularMomentum, LinearMomentum
 from jaxcon.constraints.pairs import (
     ConstantVelocity,
@@ -41,6 +42,8 @@ from jaxcon.constraints.pairs import (
     Universal,
 )
 from jaxcon.constraints.rolling import KnifeEdge, RollingCylinder, RollingDisc, RollingSphere
+from jaxcon.constraints.tendons import Tendon
+from jaxcon.constraints.wrapping import WrappedSpan
 from jaxcon.system.coordinates import TurnCounter
 
 
@@ -65,6 +68,10 @@ __all__ = [
     "SphericalSpherical",
     "Span",
     "Twist",
+    "RotationAngle",
+    "Thrust",
+    "Tendon",
+    "WrappedSpan",
     "Parallel",
     "PointOnLine",
     "PointOnPlane",

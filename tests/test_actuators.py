@@ -325,3 +325,27 @@ def test_a_counter_of_a_travel_is_refused():
         ValueError, match="TurnCounter 'count': the travel of 'rail' makes no turns"
     ):
         slide(3, jc.joints.TurnCounter("count", "rail"))
+
+
+def test_a_muscle_pulls_most_at_its_best_length():
+    """The force at L = 1 and V = 0 is F; the curves have one-sided derivatives that agree."""
+    muscle = jc.forces.Muscle("m", "hub", 10.0, 1.0, (0.85, 1.15), (0.85, 1.15))
+    system, state = wheel(2, muscle)
+
+    def force(length, rate, u):
+        q = state.q.at[2].set(length - 1)
+        moved = state.replace(q=q, v=state.v.at[2].set(rate))
+        return torque(system, moved, u[None])
+
+    at = jax.jit(lambda *x: (force(*x), jax.jacfwd(force)(*x), jax.jacfwd(force, 1)(*x)))
+    best, slope, by_rate = at(jnp.array(1.0), jnp.array(0.0), jnp.array(0.6))
+    np.testing.assert_allclose(best, -6, rtol=1e-9)
+    np.testing.assert_allclose(slope, 0, atol=1e-9)
+    np.testing.assert_allclose(by_rate, -6 * 2 / 1.5, rtol=1e-9)
+    for joint in (0.75, 1.3, 1.6, 0.5):  # the ends of the parabolas
+        before, after = (
+            at(jnp.array(joint + e), jnp.array(0.2), jnp.array(1.0)) for e in (-1e-9, 1e-9)
+        )
+        np.testing.assert_allclose(before[:2], after[:2], atol=1e-6)
+    with pytest.raises(ValueError, match="length_range must be \\(smaller, larger\\), got"):
+        wheel(2, jc.forces.Muscle("m", "hub", 10.0, 1.0, (1.2, 1.1)))

@@ -255,3 +255,27 @@ def test_a_control_may_be_an_array_of_numpy(dim):
         given = [system.force(state.q, state.v, 0.0, u) for u in (control, jnp.asarray(control))]
         np.testing.assert_array_equal(*given)
         assert np.sum(given[0]) == np.sum(control)
+
+
+def test_drag_slows_a_body_and_has_gradients():
+    """Drag along an edge and about it, by hand; the gradient by the density in float32."""
+    scene = jc.Scene(dim=3, gravity=(0, 0, 0), dtype=jnp.float32)
+    moving = {"velocity": (2.0, 0, 0), "angular_velocity": (0, 0, 3.0)}
+    scene.add_body("box", mass=2.0, inertia=(1.0, 1.0, 0.5), **moving)
+    size, ρ, η = (0.4, 0.2, 0.3), 5.0, 0.7
+    scene.add(jc.forces.FluidDrag("drag", "box", size, ρ, η, wind=(0.5, 0, 0)))
+    system, state = scene.build()
+
+    def acceleration(density):
+        changed = system.with_params({"drag": {"density": density}})
+        return jc.forward_dynamics(changed, state, None, jc.Method(), 1e-3).acceleration
+
+    density = jnp.asarray(ρ, jnp.float32)
+    found, slope = jax.jit(lambda x: (acceleration(x), jax.jacfwd(acceleration)(x)))(density)
+    force = -3 * np.pi * η * 0.3 * 1.5 - ρ * 0.06 * 1.5**2 / 2
+    blades = 0.3 * (0.4**4 + 0.2**4) * 9 / 64
+    torque = -np.pi * η * 0.3**3 * 3 - ρ * blades
+    np.testing.assert_allclose(found, [force / 2, 0, 0, 0, 0, torque / 0.5], rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(
+        slope[np.array([0, 5])], [-0.06 * 1.5**2 / 4, -2 * blades], rtol=1e-5
+    )

@@ -249,6 +249,38 @@ URDF = """
 """
 
 
+def test_urdf_with_a_mimic_joint():
+    """MuJoCo reads it as an equality of joints: θ = 2 φ + 0.1."""
+    link = '<link name="{}"><inertial><mass value="2"/><inertia ixx="0.1" iyy="0.2" izz="0.15"'
+    link += ' ixy="0" ixz="0" iyz="0"/></inertial></link>'
+    joint = '<joint name="{0}" type="continuous"><parent link="{1}"/><child link="{2}"/>'
+    joint += '<axis xyz="0 1 0"/>{3}</joint>'
+    mimic = '<mimic joint="lead" multiplier="2" offset="0.1"/>'
+    text = "".join(map(link.format, "abc")) + joint.format("lead", "a", "b", "")
+    read = jc.from_mjcf(
+        f'<robot name="arm">{text}{joint.format("follow", "b", "c", mimic)}</robot>'
+    )
+    found = jc.violation(read.system, read.state([0.3, 0.6], [0.5, 1.0])).position
+    np.testing.assert_allclose(found[-1], -0.1, atol=1e-12)
+
+
+def test_mocap_bodies_are_held_if_their_motions_are_left_out():
+    """A link hangs on the mocap body; contacts with it remain, and none between fixed geoms."""
+    held = (
+        '<geom name="floor" size="0.1"/><body name="hand" mocap="true" pos="1 0 2">'
+        '<geom name="palm" size="0.1"/><body name="finger" pos="0 1 0"><joint/>'
+        f"{BODY}</body></body>"
+        f'<body name="ball"><freejoint/>{BODY}<geom name="skin" size="0.1"/></body>'
+    )
+    m = mujoco.MjModel.from_xml_string(model(held))
+    read, data = jc.from_mjcf(m, ignore=("mocap",)), mujoco.MjData(m)
+    mujoco.mj_kinematics(m, data)
+    position = jc.position(read.system, read.start, "finger")
+    np.testing.assert_allclose(position, data.body("finger").xpos, atol=1e-12)
+    names = {name for group in read.system.bounds for name in group.names}
+    assert names == {"floor and skin", "palm and skin"}
+
+
 def test_the_map_to_states_hardly_grows_with_the_model():
     """Links are lanes of arrays and joints are iterations of a loop, so the trace hardly grows."""
     sizes = []
@@ -331,28 +363,17 @@ def test_equalities_that_are_not_active_are_left_out():
 
 
 HINGE = f'<body name="b"><joint name="j" {{}}/>{BODY}{{}}</body>'
-BALL = f'<body name="b"><joint name="j" type="ball" {{}}/>{BODY}</body>'
 GEOM = '<geom name="{}" size="0.1 0.1 0.1" {}/>'
-TENDON = '<tendon><fixed name="t" {}><joint joint="j" coef="1"/></fixed></tendon>'
 REFUSED = {
     "shape": (
         model(HINGE.format("", GEOM.format("g", 'type="cylinder"')) + GEOM.format("floor", "")),
         r"contacts between '(g|floor) and (g|floor) \((sphere|cylinder) and (sphere|cylinder)\)'",
     ),
-    "torsion": (
-        model(HINGE.format("", GEOM.format("g", 'condim="4"')) + GEOM.format("floor", "")),
-        "torsional and rolling friction of 'floor and g'",
-    ),
-    "ball_limit": (model(BALL.format('range="0 1"')), "limits of 'j'"),
-    "fluid": (model(HINGE.format("", ""), options='density="1.2"'), "option 'density'"),
-    "tendon": (model(HINGE.format("", ""), TENDON.format('stiffness="1"')), "tendons 't'"),
-    "tendon that ends": (model(HINGE.format("", ""), TENDON.format('range="0 1"')), "tendons 't'"),
-    "tendon that rubs": (
-        model(HINGE.format("", ""), TENDON.format('frictionloss="1"')),
-        "tendons 't'",
-    ),
-    "gravcomp": (model(f'<body name="b" gravcomp="1"><joint/>{BODY}</body>'), "gravcomp of 'b'"),
 }
+REFUSED["mocap"] = (
+    model(f'<body name="hand" mocap="true"/>{HINGE.format("", "")}'),
+    "motions of the mocap bodies 'hand' are not supported",
+)
 
 
 @pytest.mark.parametrize("key", REFUSED)
@@ -371,12 +392,27 @@ def acting(actuator):
 
 
 UNSUPPORTED = {
-    "mocap body": model(f'<body mocap="true"/>{HINGE.format("", "")}'),
-    "trntype 'site'": model(
-        HINGE.format("", '<site name="s"/>'), '<actuator><motor name="m" site="s"/></actuator>'
+    "trntype 'body'": model(
+        HINGE.format("", ""), '<actuator><adhesion name="m" body="b" ctrlrange="0 1"/></actuator>'
     ),
-    "dyntype 'filter'": acting('<general joint="turn" dyntype="filter" dynprm="1"/>'),
-    "biastype 'muscle'": acting(
+    "site that cannot move in the world": model(
+        HINGE.format("", "") + '<site name="s"/>', '<actuator><motor site="s"/></actuator>'
+    ),
+    "site that cannot move in the link": model(
+        HINGE.format("", '<site name="s"/><site name="t"/>'),
+        '<actuator><motor site="s" refsite="t"/></actuator>',
+    ),
+    "reference site in the body 'b', which does not carry": model(
+        HINGE.format("", '<site name="s"/>') + f'<body><joint/>{BODY}<site name="t"/></body>',
+        '<actuator><motor site="t" refsite="s"/></actuator>',
+    ),
+    "turned by 0.4 rad": model(
+        HINGE.format("", '<site name="s" axisangle="0 0 1 0.4"/>') + '<site name="t"/>',
+        '<actuator><position site="s" refsite="t" gear="0 0 0 0 0 1" kp="1"/></actuator>',
+    ),
+    "dyntype 'user'": acting('<general joint="turn" dyntype="user" actdim="1"/>'),
+    "has 2 activations": acting('<general joint="turn" dyntype="user" actdim="2"/>'),
+    "gaintype 'fixed' and the biastype 'muscle'; a muscle needs both": acting(
         '<general joint="turn" biastype="muscle" biasprm="0.75 1.05 1 200 0.5 1.6 1.5 1.3 1.2"'
         ' lengthrange="0 1"/>'
     ),
@@ -394,10 +430,9 @@ UNSUPPORTED = {
         HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
         '<contact><pair geom1="floor" geom2="g" friction="1 0.5"/></contact>',
     ),
-    "equality 'e' is of type 'tendon'": model(
-        HINGE.format("", ""),
-        '<tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
-        '<equality><tendon name="e" tendon1="t"/></equality>',
+    "friction that depends on the direction, of floor and g \\(sphere": model(
+        HINGE.format("", GEOM.format("g", "")) + GEOM.format("floor", ""),
+        '<contact><pair geom1="floor" geom2="g" condim="6" friction="1 1 0 1 2"/></contact>',
     ),
     "gear with a force and a torque": model(
         f'<body><freejoint name="f"/>{BODY}</body>',
@@ -406,6 +441,17 @@ UNSUPPORTED = {
     "'j', 'k'\\] of body 'b' pass each other": model(
         f'<body name="b"><joint name="j" axis="1 0 0"/>'
         f'<joint name="k" axis="0 1 0" pos="0 0 1"/>{BODY}</body>'
+    ),
+    "fluidshape of geom 'g'": model(
+        HINGE.format("", GEOM.format("g", 'fluidshape="ellipsoid"')), options='density="1.2"'
+    ),
+    "actuatorgravcomp of joint 'j' beside": model(
+        '<body gravcomp="1"><joint name="j" actuatorgravcomp="true" actuatorfrcrange="-1 1"/>'
+        f"{BODY}</body>",
+        '<actuator><motor joint="j"/></actuator>',
+    ),
+    "actuatorgravcomp of joint 'j' in a model": model(
+        f'<body gravcomp="1"><joint name="j" actuatorgravcomp="true"/>{BODY}</body>'
     ),
     "gimbal lock": model(
         '<body><joint axis="0 0 1"/><joint axis="1 0 0"/><joint axis="0 0 1"/>' + BODY + "</body>"

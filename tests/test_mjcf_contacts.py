@@ -146,6 +146,63 @@ def test_contacts_between_what_moves_can_be_left_out():
     assert not jc.from_mjcf(m, ignore=("contact",)).system.bounds
 
 
+TURNING = """
+<geom name="floor" type="plane" size="1 1 1" friction="0.5 0.02 0.03"/>
+<body pos="0 0 1"><freejoint/><geom name="spins" size="0.1" friction="0.7 0.01 0.04" condim="4"/>
+</body>
+<body pos="1 0 1"><freejoint/><geom name="rolls" size="0.1" friction="0.7 0.01 0.04" condim="6"
+  priority="1"/></body>
+<body pos="0 1 1"><freejoint/><geom name="slides" size="0.1" condim="3"/></body>
+"""
+
+
+def test_torsional_and_rolling_friction_are_those_of_mujoco():
+    """Rows of MuJoCo: normal, both tangents, spinning, rolling about both tangents."""
+    m = model(TURNING, default=FAR)
+    data, found = moved(m)
+    rates = {}
+    for c in (data.contact[i] for i in range(data.ncon)):
+        names = " and ".join(m.geom(int(g)).name for g in c.geom)
+        rates[names] = data.efc_vel[c.efc_address : c.efc_address + c.dim], c.friction
+    numbers = jc.from_mjcf(m).system.params
+    sizes = set()
+    for name, (expected, friction) in rates.items():
+        rows = found.rate[np.arange(len(found.rate))[found.layout.rows(name)]]
+        assert len(rows) == len(expected)
+        sizes.add(len(rows))
+        np.testing.assert_allclose(numbers[name]["friction"], friction[0])
+        if len(rows) > 3:
+            spinning, rolling = expected[3], np.linalg.norm(expected[4:])
+            np.testing.assert_allclose(abs(rows[-1]), abs(spinning), atol=EXACT)
+            np.testing.assert_allclose(np.linalg.norm(rows[3:-1]), rolling, atol=EXACT)
+            np.testing.assert_allclose(numbers[name]["spinning"], friction[2])
+        if len(rows) > 4:
+            np.testing.assert_allclose(numbers[name]["rolling"], friction[3])
+    assert sizes == {3, 4, 6}
+    plain = jc.from_mjcf(m, ignore=("torsion",)).system.params
+    assert not any("spinning" in x or "rolling" in x for x in plain.values() if isinstance(x, dict))
+
+
+@pytest.mark.parametrize("qvel", [(0.3, 0, 0, 0, 3.0, 0), (0, 0, 0, 0, 0, 8.0)])
+def test_a_ball_rolls_and_spins_as_in_mujoco(qvel):
+    """The motion is compared up to 3 %: MuJoCo's friction is soft, and its bounds share a cone."""
+    m = model(
+        '<geom type="plane" size="1 1 1" condim="1" friction="0 0 0"/><body pos="0 0 0.1">'
+        '<freejoint/><geom size="0.1" condim="6" friction="1 0.02 0.02"/></body>',
+    )
+    read, data = jc.from_mjcf(m), mujoco.MjData(m)
+    data.qvel[:], m.opt.timestep, steps = qvel, 1e-3, 100
+    method = read.method()
+    state = read.state(data.qpos, data.qvel)
+    state = jc.init(read.system, method, state.q, state.v)
+    end, _ = jax.jit(lambda s: jc.rollout(read.system, method, s, None, 1e-3, steps))(state)
+    mujoco.mj_step(m, data, steps)
+    change = data.qvel - qvel
+    assert max(abs(change)) > 0.5
+    got = np.asarray(read.qvel(end)) - qvel
+    np.testing.assert_allclose(got, change, atol=0.03 * max(abs(change)))
+
+
 JOINTS = """
 <body><joint name="hinge" {0} ref="0.1" {2} axis="0 1 0"/><geom size="0.1" contype="0"/>
 <body pos="0 0 1"><joint name="slide" type="slide" axis="1 0 0" {1}/><geom size="0.1" contype="0"/>

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
@@ -9,11 +10,13 @@ from jaxcon.constraints.armature import Armature, Armatures
 from jaxcon.constraints.base import Joints
 from jaxcon.constraints.couplings import Coupling, Couplings
 from jaxcon.constraints.drive import Drive, Drives
+from jaxcon.constraints.tendons import Tendon, Tendons
 from jaxcon.contact.limits import Bounds
 from jaxcon.core import checks
 from jaxcon.core.typing import DType, PyTree
 from jaxcon.system.actuators import JointForce, JointForces
 from jaxcon.system.coordinates import (
+    Counters,
     End,
     JointCoordinate,
     OnCoordinates,
@@ -33,7 +36,8 @@ class CoordinateElements:
     """The elements that act on joint coordinates, and the coordinates with counted turns.
 
     Args:
-        joints: groups of joints, which come first among the constraints of the system.
+        joints: groups of joints, which come first among the constraints of the system. The
+            attribute `joints` also has the groups of tendons, which follow them.
         elements: all elements of the scene.
         layout: names and indices.
         dtype: dtype of every number.
@@ -43,13 +47,19 @@ class CoordinateElements:
         self, joints: list[Joints], elements: Iterable[Element], layout: Layout, dtype: DType
     ) -> None:
         self.joints, self.layout, self.dtype = joints, layout, dtype
+        self.counters: Counters = {}
         self.elements = [e for e in elements if isinstance(e, OnCoordinates)]
         where = directory(joints)
-        self.ends = {e.name: self._ends(e, where) for e in self.elements}
+        tendons = [e for e in self.elements if isinstance(e, Tendon)]
+        self.ends = {e.name: self._ends(e, where) for e in tendons}
+        self.joints = [*joints, *self._tendons(tendons)]
+        where = directory(self.joints)
+        others = [e for e in self.elements if not isinstance(e, Tendon)]
+        self.ends |= {e.name: self._ends(e, where) for e in others}
         counting: dict[tuple[int, str], set[int]] = {}
         for element in self.elements:
             for group, index, name in self.ends[element.name]:
-                turns = turns_over(joints[group].law, name, layout.dim)
+                turns = turns_over(self.joints[group].law, name, layout.dim)
                 if isinstance(element, TurnCounter) and not turns and layout.dim == 3:
                     raise ValueError(
                         f"{label(element)}: the {name} of '{element.joint}' makes no turns."
@@ -63,6 +73,19 @@ class CoordinateElements:
             self.turns += len(indices)
         self.counted = tuple(counted)
         self.counters = numbered(self.counted)
+        self.joints = [*joints, *map(self._with_counters, self.joints[len(joints) :])]
+
+    def _tendons(self, tendons: list[Tendon]) -> list[Tendons]:
+        """Returns the groups of tendons, without the counters of their coordinates."""
+        return [
+            Tendons(params, names, places, Tendon, terms=terms, sides=sides)
+            for (params, names, places, _), terms, sides, _ in self._gather(tendons)
+        ]
+
+    def _with_counters(self, group: Tendons) -> Tendons:
+        """Returns a group of tendons whose coordinates count whole turns."""
+        ends = [[(c.group, j, c.name) for j in c.joints] for c in group.terms]
+        return dataclasses.replace(group, terms=tuple(at(self.counters, x) for x in ends))
 
     def forces(self) -> list[JointForces]:
         """Returns the groups of springs, dampers, motors and servos."""
@@ -170,7 +193,8 @@ class CoordinateElements:
         for column in columns:
             group, joints, _ = zip(*column, strict=True)
             of_joint = self.joints[group[0]].select(joints).places
-            places += [p for p in of_joint if p not in places]
+            for place in of_joint:
+                places += [] if place in places else [place]
             sides.append(tuple(places.index(p) for p in of_joint))
         return tuple(places), tuple(sides)
 
@@ -182,18 +206,25 @@ class CoordinateElements:
             where: the group of each joint and its index in the group, by joint name.
 
         Raises:
-            ValueError: a coordinate is unknown or coupled with itself, or a prescribed or coupled
-                coordinate is not the integral of its rate.
+            ValueError: a coordinate is unknown, used by tendons only, or coupled with itself. Or a
+                prescribed or coupled coordinate, or that of a tendon, is not the integral of its
+                rate.
         """
         ends = tuple(
             find(self.joints, where, label(element), *end) for end in element.joint_coordinates
         )
+        for group, index, _ in ends:
+            if self.joints[group].law.repeats and not isinstance(element, Tendon):
+                raise ValueError(
+                    f"{label(element)}: '{self.joints[group].names[index]}' has several points on"
+                    " one body; add a Tendon over it and act on the tendon."
+                )
         if len(set(ends)) < len(ends):
             raise ValueError(
                 f"{label(element)}: it couples a coordinate with itself:"
                 f" {element.joint_coordinates}."
             )
-        for group, index, name in ends if isinstance(element, Coupling | Drive) else ():
+        for group, index, name in ends if isinstance(element, Coupling | Drive | Tendon) else ():
             if self.joints[group].law.coordinates[name] == "rotation":
                 raise ValueError(
                     f"{label(element)}: the {name} of '{self.joints[group].names[index]}' is not"

@@ -96,14 +96,15 @@ class Gather:
         self.offsets, self.elements = offsets, elements
         self.origin = Pose(jnp.zeros(dim, dtype))
         joints = [e for e in self._of(Joint) if not isinstance(e, PointOnCurve)]
-        self.joints = [Joints(*group) for group in self._gather(joints)]
-        self.on_coordinates = CoordinateElements(self.joints, elements, layout, dtype)
+        groups = [Joints(*group) for group in self._gather(joints)]
+        self.on_coordinates = CoordinateElements(groups, elements, layout, dtype)
+        self.joints = self.on_coordinates.joints
 
     def constraints(self) -> list[Any]:
         """Returns the groups of equality constraints in their order in the system.
 
-        Joints come first, then drives, couplings and rotors, then curves, momenta and users'
-        functions.
+        Joints and tendons come first, then drives, couplings and rotors, then curves, momenta and
+        users' functions.
         """
         curves, momenta = [], []
         drives = self.on_coordinates.drives(self._of(Drive), self._params, _bare)
@@ -248,7 +249,8 @@ class Gather:
                 known = [WORLD, *self.layout.bodies, *self.layout.fixed]
                 raise ValueError(f"{owner}: body {name!r} is unknown; known are {known}.")
         moving = [name for name in names if name in self.layout.places]
-        if len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]:
+        repeated = len(set(moving)) < len(moving) or len(names) == 2 and names[0] == names[1]
+        if repeated and not element.repeats:
             raise ValueError(f"{owner}: it joins body '{names[0]}' to itself.")
         if not moving:
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")

@@ -49,9 +49,10 @@ class Joint(BetweenBodies):
     body_b: str
 
     coordinates: ClassVar[Mapping[str, str]] = MappingProxyType({})
-    """The unit of each coordinate by its name: "m", "rad" (with whole turns), or "rotation".
+    """The unit of each coordinate by its name: "m", "rad", "half turn" or "rotation".
 
-    "rotation" is an angle [rad] whose rate is not the derivative of any function of positions.
+    "rad" is an angle with whole turns, and "half turn" an angle in [0, π] [rad]. "rotation" is a
+    coordinate whose rate is not the derivative of any function of positions.
     """
 
     x_axis = None

@@ -10,6 +10,7 @@ Coordinates are zero at assembly, so couplings hold there. Angles count whole tu
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -317,15 +318,36 @@ class Couplings(Elements, Constraint):
             turns = [row._replace(value=Doubled.of(laps)) for row, (_, laps) in rows]
             value, turned = (self.law.relation(self.params, *x).value for x in (less, turns))
             value = value + 2 * jnp.pi * turned.value
-        pulls: dict[int, Any] = {}
-        for slope, row, sides in zip(slopes, coordinates, self.sides, strict=True):
-            for side, pull in zip(sides, row.pulls, strict=True):
-                pulls[side] = pull * slope if side not in pulls else pulls[side] + pull * slope
-        pairs = list(zip(slopes, coordinates, strict=True))
-        rate = total(slope * row.rate for slope, row in pairs)
-        bias = total(slope * row.bias for slope, row in pairs) + curvature
-        row = Row(value, rate, bias, tuple(pulls[i] for i in range(len(self.places))))
-        return [row]
+        row = combination(value, slopes, coordinates, self.sides, len(self.places))
+        return [row._replace(bias=row.bias + curvature)]
+
+
+def combination(
+    value: Lane,
+    slopes: Sequence[Lane],
+    coordinates: Sequence[Row],
+    sides: Sequence[tuple[int, ...]],
+    places: int,
+) -> Row:
+    """Returns the row of a function of joint coordinates with constant slopes sᵢ.
+
+    Its rate, bias and pulls are the sums of those of the coordinates, each times sᵢ.
+
+    Args:
+        value: the value of the function.
+        slopes: sᵢ, one for each coordinate.
+        coordinates: the coordinates as rows.
+        sides: for each coordinate, the place of each body of its joint.
+        places: the number of places.
+    """
+    pulls: dict[int, Any] = {}
+    for slope, row, own in zip(slopes, coordinates, sides, strict=True):
+        for side, pull in zip(own, row.pulls, strict=True):
+            pulls[side] = pull * slope if side not in pulls else pulls[side] + pull * slope
+    pairs = list(zip(slopes, coordinates, strict=True))
+    rate = total(slope * row.rate for slope, row in pairs)
+    bias = total(slope * row.bias for slope, row in pairs)
+    return Row(value, rate, bias, tuple(pulls[i] for i in range(places)))
 
 
 def in_ratio(ratio: Lane, a: Row, b: Row) -> Relation:

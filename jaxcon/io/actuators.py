@@ -1,30 +1,32 @@
-"""Import of MuJoCo's joint actuators; each is a control channel, in the order of MuJoCo's ctrl."""
+"""Import of MuJoCo's actuators; each is a control channel, in the order of MuJoCo's ctrl."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.measures import Thrust
 from jaxcon.constraints.pairs import Twist
 from jaxcon.core import checks
+from jaxcon.io.activations import DYNAMIC, SHORTEST
 from jaxcon.io.compiled import Compiled, Names
-from jaxcon.io.joints import Coordinate, pushing, turning
-from jaxcon.io.links import Link, LinkJoint
-from jaxcon.system.actuators import AffineActuator, Motor
+from jaxcon.io.joints import Coordinate, Ends, pushing, turning
+from jaxcon.io.links import Link, LinkJoint, scene_body
+from jaxcon.system.actuators import AffineActuator, Motor, Muscle
+from jaxcon.system.layout import WORLD
 
 
 class Transmission(NamedTuple):
-    """The transmission of an actuator: the joint coordinate on which it acts, and its gear ratio.
+    """The transmission of an actuator: the coordinate on which it acts, and its gear ratio.
 
     Attributes:
-        at: the joint coordinate θ = qpos − reference.
+        at: the coordinate θ, zero at assembly.
         gear: the gear ratio g.
-        reference: the value of qpos at assembly.
-        measured: True if the actuator length is g (θ + reference); False for free joints, whose
-            actuator length is zero.
+        reference: MuJoCo's value of the coordinate at assembly, such as qpos.
+        measured: True if the actuator length is g (θ + reference); False for free joints, and for
+            sites without a reference site, whose actuator length is zero.
     """
 
     at: Coordinate
@@ -34,118 +36,233 @@ class Transmission(NamedTuple):
 
 
 LAWS = (
-    ("trntype", "mjtTrn", ("joint", "jointinparent")),
-    ("dyntype", "mjtDyn", ("none",)),
-    ("gaintype", "mjtGain", ("fixed", "affine")),
-    ("biastype", "mjtBias", ("none", "affine")),
+    ("trntype", "mjtTrn", ("joint", "jointinparent", "tendon", "site")),
+    ("dyntype", "mjtDyn", ("none", *DYNAMIC)),
+    ("gaintype", "mjtGain", ("fixed", "affine", "muscle")),
+    ("biastype", "mjtBias", ("none", "affine", "muscle")),
 )
 """The supported types of transmission, dynamics, gain and bias.
 
 Each entry has MuJoCo's field, its enumeration, and the names of the supported values.
 """
 
-Element: TypeAlias = Motor | AffineActuator | Compound | Twist
+ALIGNED = 1e-9
+"""The largest angle [rad] between a site and its reference site that count as aligned."""
+
+Element: TypeAlias = Motor | AffineActuator | Muscle | Compound | Twist | Thrust
 """A scene element: an actuator, or a joint without constraint rows.
 
 Such a joint defines the coordinate on which an actuator acts.
 """
 
 
+class Actuators(NamedTuple):
+    """The actuators of a model.
+
+    Attributes:
+        elements: the scene elements.
+        transmissions: the transmission of each actuator, in MuJoCo's order.
+    """
+
+    elements: list[Element]
+    transmissions: list[Transmission]
+
+
 def actuators(
     compiled: Compiled,
     links: tuple[Link, ...],
-    coordinates: dict[int, Coordinate],
+    ends: Ends,
     names: Names,
-) -> Iterator[Element]:
-    """Yields the scene elements of all actuators of a model.
+) -> Actuators:
+    """Returns the scene elements of all actuators of a model.
 
     Args:
         compiled: the model.
         links: the links of the model.
-        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        ends: the scene coordinates of joints and tendons.
         names: the names in the scene.
 
     Raises:
         NotImplementedError: an actuator is not supported.
     """
+    m, found = compiled.model, Actuators([], [])
+    for i in range(len(m.actuator_trntype)):
+        _check(compiled, i)
+        name = names.take(compiled.name("actuator", i), "actuator")
+        kind, element = compiled.choice("mjtTrn", m.actuator_trntype[i]), None
+        if kind == "site":
+            element, transmission = _at_site(compiled, i, links, names)
+        elif kind == "tendon":
+            t, gear = int(m.actuator_trnid[i, 0]), float(m.actuator_gear[i, 0])
+            transmission = Transmission(ends.tendons[t], gear, float(m.tendon_length0[t]))
+        else:
+            element, transmission = _on_joint(compiled, i, links, ends.joints, names)
+        found.elements.extend([] if element is None else [element])
+        found.elements.append(_law(compiled, i, name, transmission))
+        found.transmissions.append(transmission)
+    return found
+
+
+def _on_joint(
+    compiled: Compiled,
+    i: int,
+    links: tuple[Link, ...],
+    coordinates: dict[int, Coordinate],
+    names: Names,
+) -> tuple[Compound | Twist | None, Transmission]:
+    """Returns the transmission of an actuator on a joint.
+
+    Returns:
+        A joint without constraint rows for actuators on ball and free joints, otherwise None; and
+        the transmission.
+    """
     m = compiled.model
     joints = {joint.id: (link, joint) for link in links for joint in link.joints}
-    for i in range(m.nu):
-        _check(compiled, i)
-        link, joint = joints[int(m.actuator_trnid[i, 0])]
-        name = names.take(compiled.name("actuator", i), "actuator")
-        if joint.id in coordinates:
-            gear, reference = float(m.actuator_gear[i, 0]), float(m.qpos0[joint.q])
-            transmission = Transmission(coordinates[joint.id], gear, reference)
-        else:
-            element, transmission = _vector(compiled, i, link, joint, names)
-            yield element
-        yield _law(compiled, i, name, transmission)
+    link, joint = joints[int(m.actuator_trnid[i, 0])]
+    if joint.id not in coordinates:
+        return _vector(compiled, i, link, joint, names)
+    gear, reference = float(m.actuator_gear[i, 0]), float(m.qpos0[joint.q])
+    return None, Transmission(coordinates[joint.id], gear, reference)
 
 
 def _check(compiled: Compiled, i: int) -> None:
     """Checks that an actuator has supported types of transmission, dynamics, gain and bias.
 
     Raises:
-        NotImplementedError: a type is not supported.
+        NotImplementedError: a type is not supported, or only one of gain and bias is a muscle.
     """
     m = compiled.model
+    label = compiled.name("actuator", i)
+    if (count := int(m.actuator_actnum[i])) > 1:
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{label}' has {count} activations; supported is one."
+        )
     for field, enum, supported in LAWS:
         kind = compiled.choice(enum, getattr(m, f"actuator_{field}")[i])
         if kind not in supported:
             raise NotImplementedError(
-                f"from_mjcf: actuator '{compiled.name('actuator', i)}' has the {field} '{kind}';"
+                f"from_mjcf: actuator '{label}' has the {field} '{kind}';"
                 f" supported are {list(supported)}."
             )
+    laws = (
+        compiled.choice("mjtGain", m.actuator_gaintype[i]),
+        compiled.choice("mjtBias", m.actuator_biastype[i]),
+    )
+    if "muscle" in laws and laws != ("muscle", "muscle"):
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{label}' has the gaintype '{laws[0]}' and the biastype"
+            f" '{laws[1]}'; a muscle needs both."
+        )
 
 
 def _law(
     compiled: Compiled, i: int, name: str, transmission: Transmission
-) -> Motor | AffineActuator:
+) -> Motor | AffineActuator | Muscle:
     """Builds actuator i with MuJoCo's force law (g₀ + g₁ l + g₂ l̇) u + b₀ + b₁ l + b₂ l̇.
 
     u is the control, l = g (θ + reference) the actuator length with the gear ratio g, g_i the gain
     parameters and b_i the bias parameters. The result is a `Motor` if the force is proportional to
-    u and has no limits.
+    u and has no limits. Muscles have a law of their own.
     """
     at, gear, reference, measured = transmission
     m = compiled.model
+    # the input of an actuator with an activation is the activation, which has another range
+    acts = compiled.choice("mjtDyn", m.actuator_dyntype[i]) != "none"
+    clamped = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl") and not acts
+    control = m.actuator_ctrlrange[i] if clamped else None
+    force = _force_range(compiled, i, gear)
+    if compiled.choice("mjtGain", m.actuator_gaintype[i]) == "muscle":
+        length = gear * reference * measured
+        return _muscle(compiled, i, name, at, (gear, length), control, force)
     gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
     gain[1:] *= compiled.choice("mjtGain", m.actuator_gaintype[i]) == "affine"
     bias *= compiled.choice("mjtBias", m.actuator_biastype[i]) == "affine"
     for law in (gain, bias):
         law[0] += law[1] * gear * reference
         law[1] *= measured
-    clamped = m.actuator_ctrllimited[i] and not compiled.disabled("clampctrl")
-    control = m.actuator_ctrlrange[i] if clamped else None
-    force = _force_range(compiled, i, gear)
     if not gain[1:].any() and not bias.any() and force is None:
         return Motor(name, at.joint, gear * gain[0], control, at.name)
     return AffineActuator(name, at.joint, gain, bias, gear, control, force, at.name)
+
+
+def _muscle(
+    compiled: Compiled,
+    i: int,
+    name: str,
+    at: Coordinate,
+    lever: tuple[float, float],
+    control: np.ndarray | None,
+    force: np.ndarray | None,
+) -> Muscle:
+    """Builds actuator i as a muscle.
+
+    Args:
+        compiled: the model.
+        i: MuJoCo's id of the actuator.
+        name: the name of the element.
+        at: the coordinate on which the muscle acts.
+        lever: the gear ratio, and the length of the actuator at assembly.
+        control: the range of the activation.
+        force: the range of the force.
+
+    Raises:
+        NotImplementedError: gain and bias have different parameters.
+    """
+    m, parameters = compiled.model, compiled.model.actuator_gainprm[i, :9]
+    passive = m.actuator_biasprm[i, :9]
+    if np.any(parameters[[0, 1, 2, 3, 5]] != passive[[0, 1, 2, 3, 5]]):
+        raise NotImplementedError(
+            f"from_mjcf: actuator '{compiled.name('actuator', i)}' has different muscle parameters"
+            " in gainprm and biasprm, which is not supported."
+        )
+    low, high, largest, scale, shortest, longest, fastest, _, lengthening = parameters
+    if largest < 0:
+        largest = scale / max(m.actuator_acc0[i], SHORTEST)
+    return Muscle(
+        name,
+        at.joint,
+        largest,
+        lever[1],
+        m.actuator_lengthrange[i],
+        (low, high),
+        shortest,
+        longest,
+        fastest,
+        passive[7],
+        lengthening,
+        lever[0],
+        control,
+        force,
+        at.name,
+    )
 
 
 def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     """Returns the force range of an actuator, (2,); None if there are no limits.
 
     It is the range of the actuator's force before multiplication by the gear ratio. It respects the
-    limits of the actuator and of its joint.
+    limits of the actuator and of its joint or tendon.
 
     Raises:
-        NotImplementedError: the joint limits the sum of several actuators.
+        NotImplementedError: the joint or tendon limits the sum of several actuators.
     """
-    m, joint = compiled.model, int(compiled.model.actuator_trnid[i, 0])
+    m, owner = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
-    if not m.jnt_actfrclimited[joint] or not gear:
-        return of_actuator
     kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
-    on_joint = np.isin(kinds, ("joint", "jointinparent")) & (m.actuator_trnid[:, 0] == joint)
-    if sum(on_joint) > 1:
+    if kinds[i] == "site" or not gear:
+        return of_actuator
+    what, field = ("tendon", "tendon") if kinds[i] == "tendon" else ("joint", "jnt")
+    if not getattr(m, f"{field}_actfrclimited")[owner]:
+        return of_actuator
+    same = ("tendon",) if what == "tendon" else ("joint", "jointinparent")
+    beside = np.isin(kinds, same) & (m.actuator_trnid[:, 0] == owner)
+    if sum(beside) > 1:
         raise NotImplementedError(
-            f"from_mjcf: joint '{compiled.name('joint', joint)}' has an actuatorfrcrange and"
-            f" {sum(on_joint)} actuators, whose sum it limits; give each a forcerange instead."
+            f"from_mjcf: {what} '{compiled.name(what, owner)}' has an actuatorfrcrange and"
+            f" {sum(beside)} actuators, whose sum it limits; give each a forcerange instead."
         )
-    of_joint = np.sort(m.jnt_actfrcrange[joint] / gear)
-    return of_joint if of_actuator is None else np.clip(of_actuator, *of_joint)
+    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / gear)
+    return limits if of_actuator is None else np.clip(of_actuator, *limits)
 
 
 def _vector(
@@ -183,3 +300,75 @@ def _vector(
     twist = turning(link, world, names.take(f"{label} twist", "twist"), backward=in_parent)
     at, sign = Coordinate(twist.name, "twist"), -1 if in_parent else 1
     return twist, Transmission(at, sign * size, measured=joint.kind == "ball")
+
+
+def _at_site(
+    compiled: Compiled, i: int, links: tuple[Link, ...], names: Names
+) -> tuple[Compound | Twist | Thrust, Transmission]:
+    """Builds the transmission of an actuator at a site.
+
+    Without a reference site, the gear is a force and a torque in the frame of the site. With a
+    reference site, the gear is a force or a torque in its frame, and the actuator length is the
+    position of the site, or its rotation vector, in this frame.
+
+    Returns:
+        A joint without constraint rows, and the transmission on its coordinate.
+
+    Raises:
+        NotImplementedError: the site cannot move relative to its reference, the reference site is
+            in no link that carries the site, the gear has both a force and a torque, or a torque
+            depends on the rotation between sites that are not aligned at the reference pose.
+    """
+    m, data = compiled.model, compiled.data
+    label, (site, reference) = compiled.name("actuator", i), map(int, m.actuator_trnid[i])
+    owner, gear = f"from_mjcf: actuator '{label}'", m.actuator_gear[i]
+    body = scene_body(compiled, links, int(m.site_bodyid[site]))
+    point = data.site_xpos[site]
+    above = WORLD if reference < 0 else scene_body(compiled, links, int(m.site_bodyid[reference]))
+    if body == above:
+        what = "world" if reference < 0 else "link of its reference site"
+        raise NotImplementedError(f"{owner} is at a site that cannot move in the {what}.")
+    frame = data.site_xmat[site if reference < 0 else reference].reshape(3, 3)
+    force, torque = frame @ gear[:3], frame @ gear[3:]
+    if reference < 0:
+        thrust = Thrust(names.take(f"{label} thrust", "thrust"), WORLD, body, point, force, torque)
+        return thrust, Transmission(Coordinate(thrust.name, "thrust"), 1.0, measured=False)
+    parents = {link.name: link.above for link in links}
+    carriers = [parents[body]]
+    while carriers[-1] != WORLD:
+        carriers.append(parents[carriers[-1]])
+    if above not in carriers:
+        raise NotImplementedError(
+            f"{owner} has a reference site in the body '{above}', which does not carry the site;"
+            " put the reference site into one of the bodies that do, or into the world."
+        )
+    if force.any() and torque.any():
+        raise NotImplementedError(
+            f"{owner} has a reference site and a gear with a force and a torque,"
+            f" {checks.numerals(gear)}; give each an actuator of its own."
+        )
+    if torque.any():
+        size = float(np.linalg.norm(torque))
+        turned = np.zeros(3)
+        turns = [np.zeros(4) for _ in range(2)]
+        for turn, end in zip(turns, (site, reference), strict=True):
+            compiled.mujoco.mju_mat2Quat(turn, data.site_xmat[end])
+        compiled.mujoco.mju_subQuat(turned, *turns)
+        if np.linalg.norm(turned) > ALIGNED and (
+            m.actuator_gainprm[i, 1] or m.actuator_biasprm[i, 1]
+        ):
+            raise NotImplementedError(
+                f"{owner} has a torque that depends on the rotation from its reference site to its"
+                f" site, which are turned by {np.linalg.norm(turned):.3g} rad in the reference"
+                " pose; align them there."
+            )
+        name = names.take(f"{label} twist", "twist")
+        twist = Twist(name, body, above, axis=torque / size)  # the axis turns with `above`
+        return twist, Transmission(Coordinate(name, "twist"), -size)
+    size = float(np.linalg.norm(force))
+    axes = np.linalg.svd(force[None])[2] if size else np.eye(3)
+    axes[0] = force / size if size else axes[0]
+    name = names.take(f"{label} push", "push")
+    push = Compound(name, above, body, point, slides=(*axes,), ball=True)
+    distance = float(axes[0] @ (point - data.site_xpos[reference]))
+    return push, Transmission(Coordinate(name, "travel_1"), size, distance)

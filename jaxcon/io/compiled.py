@@ -100,6 +100,14 @@ class Compiled:
         """Returns the name of a value of a MuJoCo enumeration, such as "hinge" for mjtJoint 3."""
         return getattr(self.mujoco, enum)(int(value)).name.split("_", 1)[1].lower()
 
+    def root(self, body: int) -> int:
+        """Returns MuJoCo's id of the first body of the link with a body; 0 if it does not move.
+
+        Mocap bodies are held at their pose in the model.
+        """
+        weld = int(self.model.body_weldid[body])
+        return 0 if self.model.body_mocapid[weld] >= 0 else weld
+
     def disabled(self, *features: str) -> bool:
         """Returns True if `ignored` or a flag of the model disables any of these features."""
         if self.ignored.intersection(features):
@@ -113,10 +121,15 @@ class Names:
     """The names used in a scene, which must be unique.
 
     In MuJoCo, objects of different kinds may have equal names.
+
+    Attributes:
+        taken: the names in the scene.
+        given: the name in the scene by the wanted name and the kind of the object.
     """
 
     def __init__(self) -> None:
         self.taken = {"world", "gravity"}
+        self.given: dict[tuple[str, str], str] = {}
 
     def take(self, name: str, kind: str) -> str:
         """Reserves a unique name and returns it.
@@ -131,6 +144,7 @@ class Names:
         while free in self.taken:
             free, n = f"{name} {kind}" + f" {n}" * (n > 1), n + 1
         self.taken.add(free)
+        self.given.setdefault((name, kind), free)
         return free
 
 

@@ -42,7 +42,7 @@ def _on_plane(
             center=center,
             normal=normal,
             point=data.geom_xpos[pair.first],
-            friction=pair.friction[0] if pair.condim > 1 else 0.0,
+            **pair.material(compiled.ignored),
         )
 
 
@@ -87,5 +87,5 @@ def _round(
         radius_b=radii[1],
         segment_a=_axis(compiled, pair.first),
         segment_b=_axis(compiled, pair.second),
-        friction=pair.friction[0] if pair.condim > 1 else 0.0,
+        **pair.material(compiled.ignored),
     )

@@ -1,4 +1,4 @@
-"""Import of MuJoCo's equality constraints: connect, weld and joint couplings.
+"""Import of MuJoCo's equality constraints: connect, weld, and couplings of joints and tendons.
 
 MuJoCo's constraints are soft, with `solref` and `solimp`. Here they are rigid, like joints.
 """
@@ -19,7 +19,7 @@ from jaxcon.core.typing import Array, Scalar
 from jaxcon.geometry import quaternion
 from jaxcon.geometry.pose import Pose
 from jaxcon.io.compiled import Compiled, Names
-from jaxcon.io.joints import Coordinate
+from jaxcon.io.joints import Ends
 from jaxcon.io.links import Link, scene_body
 from jaxcon.system.elements import own_point
 
@@ -76,7 +76,7 @@ class Welded(Fixed):
 def equalities(
     compiled: Compiled,
     links: tuple[Link, ...],
-    coordinates: dict[int, Coordinate],
+    ends: Ends,
     names: Names,
 ) -> Iterator[Connected | Welded | Drive | PolynomialCoupling]:
     """Yields the scene elements of all active equality constraints of a model.
@@ -84,7 +84,7 @@ def equalities(
     Args:
         compiled: the model.
         links: the links of the model.
-        coordinates: the scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        ends: the scene coordinates of joints and tendons.
         names: the names in the scene.
 
     Raises:
@@ -98,28 +98,28 @@ def equalities(
             continue
         label = compiled.name("equality", i)
         kind = compiled.choice("mjtEq", m.eq_type[i])
-        if kind not in ("connect", "weld", "joint"):
+        if kind not in ("connect", "weld", "joint", "tendon"):
             raise NotImplementedError(
-                f"from_mjcf: equality '{label}' is of type '{kind}'; supported are connect, weld"
-                " and joint."
+                f"from_mjcf: equality '{label}' is of type '{kind}'; supported are connect, weld,"
+                " joint and tendon."
             )
         name = names.take(label, "equality")
-        if kind == "joint":
-            yield _coupling(compiled, i, name, coordinates)
+        if kind in ("joint", "tendon"):
+            yield _coupling(compiled, i, name, ends)
         else:
             yield _closure(compiled, i, kind, name, links)
 
 
-def _coupling(
-    compiled: Compiled, i: int, name: str, coordinates: dict[int, Coordinate]
-) -> Drive | PolynomialCoupling:
-    """Builds the coupling y − y₀ = Σ cₖ (x − x₀)ᵏ of two joint coordinates x and y.
+def _coupling(compiled: Compiled, i: int, name: str, ends: Ends) -> Drive | PolynomialCoupling:
+    """Builds the coupling y − y₀ = Σ cₖ (x − x₀)ᵏ of two coordinates x and y, of joints or tendons.
 
-    x₀ and y₀ are the values in the reference pose. If the constraint names only one joint, its
+    x₀ and y₀ are the values in the reference pose. If the constraint names only one object, its
     coordinate y is held at y₀ + c₀.
     """
     m = compiled.model
     first, second, coefficients = int(m.eq_obj1id[i]), int(m.eq_obj2id[i]), m.eq_data[i, :5]
+    of_joints = compiled.choice("mjtEq", m.eq_type[i]) == "joint"
+    coordinates = ends.joints if of_joints else ends.tendons
     y = coordinates[first]
     if second < 0:
         return Drive(name, y.joint, held, {"value": float(coefficients[0])}, y.name)

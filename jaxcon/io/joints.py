@@ -32,6 +32,18 @@ class Coordinate(NamedTuple):
     name: str
 
 
+class Ends(NamedTuple):
+    """The scene coordinates on which actuators and equalities act.
+
+    Attributes:
+        joints: the coordinate of each hinge and slide, by MuJoCo's joint id.
+        tendons: the coordinate of each tendon, by MuJoCo's tendon id.
+    """
+
+    joints: dict[int, Coordinate]
+    tendons: dict[int, Coordinate]
+
+
 class Joined(NamedTuple):
     """The joint between a link and its parent, as scene elements.
 

@@ -57,7 +57,7 @@ def find_links(compiled: Compiled, names: Names) -> tuple[Link, ...]:
     links: list[Link] = []
     index = {0: -1}
     for body in range(1, m.nbody):
-        if m.body_weldid[body] != body:
+        if compiled.root(body) != body:
             continue
         start = int(m.body_jntadr[body])
         joints = tuple(
@@ -70,7 +70,7 @@ def find_links(compiled: Compiled, names: Names) -> tuple[Link, ...]:
             for j in range(start, start + int(m.body_jntnum[body]))
         )
         members = tuple(int(i) for i in np.flatnonzero(m.body_weldid == body))
-        parent = index[int(m.body_weldid[m.body_parentid[body]])]
+        parent = index[compiled.root(m.body_parentid[body])]
         index[body] = len(links)
         name = names.take(compiled.name("body", body), "body")
         above = WORLD if parent < 0 else links[parent].name

@@ -15,17 +15,24 @@ from jaxcon.core import checks
 from jaxcon.core.pytree import pytree, static
 from jaxcon.core.summary import listed, span, table
 from jaxcon.core.typing import Array, DType, Scalar
+from jaxcon.execution.step import SolutionAt
 from jaxcon.io import maps
-from jaxcon.io.actuators import actuators
+from jaxcon.io.activations import Activations, activations
+from jaxcon.io.actuators import Transmission, actuators
 from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
 from jaxcon.io.equalities import equalities
-from jaxcon.io.joints import Coordinate, join
+from jaxcon.io.joints import Coordinate, Ends, join
 from jaxcon.io.links import Link, find_links, offset, solid
 from jaxcon.io.maps import Node, Tree
-from jaxcon.io.passive import passive
+from jaxcon.io.measuring import Reading
+from jaxcon.io.passive import fluid_drag, gravity_compensation, passive
 from jaxcon.io.refusals import left_out, refuse
+from jaxcon.io.sensor_import import Importer
+from jaxcon.io.sensors import Sensors
+from jaxcon.io.tendons import passive_tendons, tendons
 from jaxcon.methods.method import Method
+from jaxcon.step import StepInfo
 from jaxcon.system.body_system import BodySystem
 from jaxcon.system.coordinates import TurnCounter
 from jaxcon.system.inertial import restate
@@ -39,10 +46,12 @@ class Keyframe:
     Attributes:
         state: the state of the system.
         control: MuJoCo's ctrl, (nu,).
+        activation: MuJoCo's act, (na,).
     """
 
     state: State
     control: Array
+    activation: Array
 
 
 @pytree
@@ -50,7 +59,8 @@ class MujocoModel:
     """An imported MuJoCo model: a system, and conversions to and from MuJoCo's coordinates.
 
     `system, state = model` unpacks the system and its initial state, as `jc.Scene.build` returns
-    them. `model.method()` is a suitable `jc.Method`. The control array is MuJoCo's ctrl.
+    them. `model.method()` is a suitable `jc.Method`. The control array is MuJoCo's ctrl, with the
+    activations of filters, integrators and muscles in place of their controls; see `activate`.
 
     Attributes:
         system: the system. Links, joints and actuators have MuJoCo's names. If an object of another
@@ -58,7 +68,9 @@ class MujocoModel:
         start: the state in MuJoCo's reference pose, at rest.
         timestep: the step size in the model's options, () [s].
         tree: the kinematic tree in MuJoCo's coordinates.
-        keys: time, qpos, qvel and ctrl of each keyframe.
+        keys: time, qpos, qvel, ctrl and act of each keyframe.
+        readings: the sensors; `sensors` reads them.
+        activations: the dynamics of the activations; `activate` advances them.
         joints: for each hinge and slide, its name in MuJoCo, and its coordinate in the system.
         keyframes: the names of the keyframes; "key 0" and so on for keyframes without a name.
     """
@@ -68,6 +80,8 @@ class MujocoModel:
     timestep: Array
     tree: Tree
     keys: tuple[dict[str, Array], ...]
+    readings: Sensors
+    activations: Activations
     joints: tuple[tuple[str, Coordinate], ...] = static()
     keyframes: tuple[str, ...] = static()
 
@@ -174,6 +188,81 @@ class MujocoModel:
         slopes = self.system.kinematics(state.q, state.v), acceleration
         return jax.jvp(qvel, (state.q, state.v), slopes)[1]
 
+    @property
+    def activation(self) -> Array:
+        """MuJoCo's act at the start, (na,): zeros."""
+        return jnp.zeros(len(self.activations.kinds), self.start.q.dtype)
+
+    def activate(
+        self, activation: Array, control: Array, dt: Scalar | None = None
+    ) -> tuple[Array, Array]:
+        """Advances the activations of filters, integrators and muscles by a step.
+
+        The control of the system has the activations in place of the controls of these actuators.
+        A step of a model with activations is
+
+            act, control = model.activate(act, ctrl, dt)
+            state, info = jc.step(model.system, method, state, control, dt)
+
+        as in MuJoCo's Euler integrator. Begin with act = `model.activation`.
+
+        Args:
+            activation: MuJoCo's act, (na,).
+            control: MuJoCo's ctrl, (nu,).
+            dt: the step size h, () [s]; `timestep` by default.
+
+        Returns:
+            The activations after the step, (na,), and the control of the system, (nu,).
+        """
+        dtype, count = self.start.q.dtype, len(self.activations.kinds)
+        act = checks.real("activate", "activation", activation, dtype, (count,))
+        n_u = self.system.layout.n_u
+        ctrl = checks.real("activate", "control", control, dtype, (n_u,))
+        h = self.timestep if dt is None else checks.real("activate", "dt", dt, dtype)
+        return self.activations.advance(act, ctrl, h)
+
+    @property
+    def sensor_slices(self) -> dict[str, slice]:
+        """The slice of each sensor in MuJoCo's sensordata, by name."""
+        return {x.name: slice(x.start, x.start + x.size) for x in self.readings.entries}
+
+    def sensors(
+        self,
+        state: State,
+        info: StepInfo | SolutionAt | None = None,
+        control: Array | None = None,
+        names: Sequence[str] | None = None,
+    ) -> Array:
+        """Reads the sensors, (nsensordata,), as MuJoCo's sensordata; a pure function.
+
+        Accelerometers and sensors of force, torque and touch read the `info`, at its state, which
+        is the start of the step. All other sensors read `state`. For readings of one instant, as in
+        MuJoCo, pass the state before the step, or `jc.forward_dynamics` of the state. Cutoffs are
+        applied; noise is not added.
+
+        Args:
+            state: the state of one world.
+            info: the info of a step, or the result of `jc.forward_dynamics`. Models without these
+                sensors need none.
+            control: the control of the system, (nu,); by default the control of the info.
+            names: the sensors to read, in the order of the result; by default all. Sensors without
+                a name are called "sensor 0" and so on.
+
+        Raises:
+            ValueError: a name is unknown, or a sensor needs an info or the control.
+            NotImplementedError: a sensor is not supported; the message names it.
+        """
+        chosen = self.readings.chosen(names)
+        control = info.control if control is None and info is not None else control
+        self.readings.check(chosen, info, control, self.system.layout.n_u)
+        if control is not None:
+            given = state.q.dtype, (self.system.layout.n_u,)
+            control = checks.real("sensors", "control", control, *given)
+        model = self.system, self.tree, self.readings.parts
+        here = Reading(*model, state, None, control)
+        start = here if info is None else Reading(*model, info.state, info, control)
+        return self.readings.read(here, start, chosen)
+
     def keyframe(self, name: str) -> Keyframe:
         """Returns the state and controls of a keyframe.
 
@@ -186,7 +275,8 @@ class MujocoModel:
         if name not in self.keyframes:
             raise ValueError(f"keyframe '{name}' is unknown; known are {list(self.keyframes)}.")
         key = self.keys[self.keyframes.index(name)]
-        return Keyframe(self.state(key["qpos"], key["qvel"], key["time"]), key["ctrl"])
+        state = self.state(key["qpos"], key["qvel"], key["time"])
+        return Keyframe(state, key["ctrl"], key["act"])
 
 
 def from_mjcf(
@@ -202,19 +292,36 @@ def from_mjcf(
     constraints are rigid, like joints; `solref` and `solimp` are not used. The integrator and the
     step size are not imported; `timestep` is the step size in the model.
 
-    Features without effect on the motion (sites, cameras, sensors) are dropped. Unsupported
-    features with an effect raise an error that names them.
+    The attribute gravcomp becomes a constant `jc.forces.Force`. It does not follow later changes of
+    mass or gravity. Density and viscosity become a `jc.forces.FluidDrag` on the inertia box of each
+    body. The model of ellipsoids (fluidshape) is not supported.
 
-    Ranges of hinges and slides become `jc.contacts.Limit`. The attribute frictionloss becomes
+    The method `sensors` of the model reads its sensors. Features without effect on the motion, such
+    as cameras, are dropped. Unsupported features with an effect raise an error that names them.
+
+    Actuators act on joints and tendons, or at sites: without a reference site as a
+    `jc.joints.Thrust`, which adds a force and a torque that turn with the site. Muscles become a
+    `jc.forces.Muscle`. The method `activate` of the model advances the activations of filters,
+    integrators and muscles.
+
+    Tendons become a `jc.joints.Tendon`: over joints, or over a `jc.joints.Span` for each segment
+    between sites. Segments that wrap around spheres and cylinders are a `jc.joints.WrappedSpan`,
+    which takes the shorter way; sidesite is not supported.
+
+    Ranges of hinges and slides become `jc.contacts.Limit`. Ranges of ball joints limit a
+    `jc.joints.RotationAngle`. The attribute frictionloss becomes
     `jc.contacts.JointFriction`. Pairs of geoms become contacts: spheres, capsules and boxes on
     planes, and spheres and capsules with each other. A capsule touches a plane at its ends, and a
     box at its corners.
 
     Limits and contacts are hard and inelastic; `solref` and `solimp` are not used. They act at the
     distance `margin`, where MuJoCo's soft limits and contacts begin to act. Friction is Coulomb
-    friction with the sliding coefficient. Read reactions as `info.reactions["knee limit"]`,
-    `["knee friction"]` or `["floor and foot"]`. If a pair has several contact points, their names
-    are numbered.
+    friction with the sliding coefficient. Torsional and rolling friction (condim 4 and 6) become
+    `spinning` and `rolling` of the contact. Sliding, spinning and rolling have one bound each; in
+    MuJoCo they share one cone.
+
+    Read reactions as `info.reactions["knee limit"]`, `["knee friction"]` or `["floor and foot"]`.
+    If a pair has several contact points, their names are numbered.
 
     Every pair of geoms adds rows to every step, whether it touches or not. In many models, most
     pairs are between the robot's own limbs; `ignore=("self_contact",)` keeps only contacts with the
@@ -226,11 +333,12 @@ def from_mjcf(
             "contact": all contacts,
             "self_contact": contacts between two moving bodies,
             "shape": contacts between unsupported shapes,
+            "mocap": motions of mocap bodies, which are held at their pose in the model,
             "torsion": torsional and rolling friction (condim 4 or 6),
             "limit": all joint limits,
             "ball_limit": limits of ball joints,
             "friction": dry friction of joints,
-            "tendon": tendons,
+            "tendon": springs, dampers, rotors, friction and ranges of tendons,
             "fluid": density and viscosity,
             "gravcomp": gravity compensation.
         count_turns: True to count the whole turns of every hinge, so that `qpos` includes them.
@@ -256,8 +364,9 @@ def from_mjcf(
         frame = compiled.data.xpos[link.body], compiled.data.xquat[link.body]
         body = solid(compiled, link, scene.dtype)
         scene.add_body(link.name, inertia=body, position=frame[0], quaternion=frame[1])
-    coordinates = _add_elements(scene, compiled, links, names, count_turns)
+    coordinates, transmissions = _add_elements(scene, compiled, links, names, count_turns)
     system, state = scene.build()
+    sensors = Importer(compiled, links, names, transmissions, system).sensors()
     m = compiled.model
 
     def cast(x: np.ndarray) -> Array:
@@ -265,7 +374,7 @@ def from_mjcf(
         return jnp.asarray(x, scene.dtype)
 
     keys = [
-        {"time": m.key_time[i], "qpos": m.key_qpos[i], "qvel": m.key_qvel[i], "ctrl": m.key_ctrl[i]}
+        {x: getattr(m, f"key_{x}")[i] for x in ("time", "qpos", "qvel", "ctrl", "act")}
         for i in range(m.nkey)
     ]
     timestep = checks.check("from_mjcf", "timestep of the option", m.opt.timestep, (), above=0)
@@ -275,6 +384,8 @@ def from_mjcf(
         cast(timestep),
         _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
+        sensors,
+        activations(compiled, scene.dtype),
         tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),
         tuple(compiled.name("key", i) for i in range(m.nkey)),
     )
@@ -282,11 +393,12 @@ def from_mjcf(
 
 def _add_elements(
     scene: Scene, compiled: Compiled, links: tuple[Link, ...], names: Names, count: bool
-) -> dict[int, Coordinate]:
-    """Adds joints, equality constraints, actuators, passive elements and contacts to a scene.
+) -> tuple[dict[int, Coordinate], list[Transmission]]:
+    """Adds joints, tendons, equalities, actuators, passive elements and contacts to a scene.
 
     Returns:
-        The scene coordinate of each hinge and slide, by MuJoCo's joint id.
+        The scene coordinate of each hinge and slide, by MuJoCo's joint id; and the transmissions of
+        the actuators.
     """
     coordinates: dict[int, Coordinate] = {}
     for link in links:
@@ -294,9 +406,14 @@ def _add_elements(
         coordinates |= joined.coordinates
         for element in joined.elements:
             scene.add(element)
-    for element in equalities(compiled, links, coordinates, names):
+    strung = tendons(compiled, links, coordinates, names)
+    for element in (*strung.elements, *passive_tendons(compiled, strung.coordinates, names)):
         scene.add(element)
-    for element in actuators(compiled, links, coordinates, names):
+    ends = Ends(coordinates, strung.coordinates)
+    for element in equalities(compiled, links, ends, names):
+        scene.add(element)
+    acting = actuators(compiled, links, ends, names)
+    for element in acting.elements:
         scene.add(element)
     for link in links:
         for joint in link.joints:
@@ -306,9 +423,12 @@ def _add_elements(
             if count and at is not None and joint.kind == "hinge":
                 label = compiled.name("joint", joint.id)
                 scene.add(TurnCounter(names.take(f"{label} turns", "turns"), *at))
+    for on_bodies in (gravity_compensation, fluid_drag):
+        for element in on_bodies(compiled, links, names):
+            scene.add(element)
     for element in contacts(compiled, links, names):
         scene.add(element)
-    return coordinates
+    return coordinates, acting.transmissions
 
 
 def _tree(

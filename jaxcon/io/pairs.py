@@ -23,7 +23,8 @@ class GeomPair(NamedTuple):
         second: MuJoCo's id of the second geom.
         condim: MuJoCo's dimension of the contact: 1 without friction, 3 with sliding friction, 4
             also with torsional friction, 6 also with rolling friction.
-        friction: the friction coefficients μ along both tangents, (2,).
+        friction: the coefficients, (5,): sliding friction μ along both tangents, then the lengths
+            of resistance to spinning, and to rolling about both tangents [m].
         margin: the distance at which contact begins [m].
     """
 
@@ -32,6 +33,19 @@ class GeomPair(NamedTuple):
     condim: int
     friction: np.ndarray
     margin: float
+
+    def material(self, ignored: frozenset[str]) -> dict[str, float]:
+        """Returns the fields `friction`, `spinning` and `rolling` of the contact, by condim.
+
+        Args:
+            ignored: the features that the user chose to ignore.
+        """
+        turning = self.condim > 3 and "torsion" not in ignored
+        return {
+            "friction": float(self.friction[0]) if self.condim > 1 else 0.0,
+            "spinning": float(self.friction[2]) if turning else 0.0,
+            "rolling": float(self.friction[3]) if turning and self.condim == 6 else 0.0,
+        }
 
 
 def pairs(compiled: Compiled) -> list[GeomPair]:
@@ -54,8 +68,7 @@ def _acts(compiled: Compiled, pair: GeomPair) -> bool:
     It needs none if both shapes are in `FLAT`, if both geoms belong to the same link or to the
     world, or if the user ignores contacts between moving bodies ("self_contact").
     """
-    weld, body = compiled.model.body_weldid, compiled.model.geom_bodyid
-    first, second = (int(weld[body[g]]) for g in pair[:2])  # link's first body; 0 for world
+    first, second = (compiled.root(compiled.model.geom_bodyid[g]) for g in pair[:2])
     flat = all(kind in FLAT for kind in shapes(compiled, pair))
     left_out = first and second and "self_contact" in compiled.ignored
     return first != second and not flat and not left_out
@@ -84,7 +97,7 @@ def _listed(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
     for i in range(m.npair):
         ends = _ordered(compiled, int(m.pair_geom1[i]), int(m.pair_geom2[i]))
         margin = margins.of_pair(m.pair_margin[i], m.pair_gap[i])
-        yield GeomPair(*ends, int(m.pair_dim[i]), m.pair_friction[i, :2], margin)
+        yield GeomPair(*ends, int(m.pair_dim[i]), m.pair_friction[i], margin)
 
 
 def _filtered(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
@@ -121,9 +134,10 @@ def _combined(compiled: Compiled, ends: tuple[int, int], margins: Margins) -> Ge
     m, geoms = compiled.model, list(ends)
     highest = m.geom_priority[geoms].max()
     rule = [g for g in geoms if m.geom_priority[g] == highest]
-    friction = m.geom_friction[rule, 0].max()
+    sliding, spinning, rolling = m.geom_friction[rule].max(axis=0)
+    friction = np.array([sliding, sliding, spinning, rolling, rolling])
     margin = margins.of_geoms(m.geom_margin[geoms], m.geom_gap[geoms])
-    return GeomPair(*ends, int(m.geom_condim[rule].max()), np.full(2, friction), margin)
+    return GeomPair(*ends, int(m.geom_condim[rule].max()), friction, margin)
 
 
 class Margins:

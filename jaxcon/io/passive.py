@@ -1,4 +1,7 @@
-"""Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints."""
+"""Import of springs, dampers, rotor inertia, dry friction and limits of MuJoCo's joints.
+
+Gravity compensation and drag of bodies are imported here, too.
+"""
 
 from __future__ import annotations
 
@@ -9,14 +12,21 @@ import numpy as np
 
 from jaxcon.constraints.armature import Armature
 from jaxcon.constraints.compound import Compound
+from jaxcon.constraints.measures import RotationAngle
 from jaxcon.constraints.pairs import Twist
 from jaxcon.contact.limits import JointFriction, Limit
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, pushing, turning
-from jaxcon.io.links import Link, LinkJoint
+from jaxcon.io.links import Link, LinkJoint, scene_body
 from jaxcon.system.actuators import JointDamper, JointSpring
+from jaxcon.system.fluid import FluidDrag
+from jaxcon.system.forces import Force
+from jaxcon.system.layout import WORLD
 
-Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Compound | Twist
+SMALLEST = 1e-15
+"""MuJoCo's mjMINVAL: lighter bodies have no drag, and squares of sizes are at least as large."""
+Joint: TypeAlias = Compound | Twist | RotationAngle
+Element: TypeAlias = JointSpring | JointDamper | Armature | JointFriction | Limit | Joint
 """A scene element: a passive element, or a joint without constraint rows.
 
 Such a joint defines the coordinate on which passive elements act.
@@ -49,11 +59,66 @@ def passive(
         rest = m.qpos_spring[joint.q] - m.qpos0[joint.q]
         yield from _along(label, at, numbers, rest, names)
         yield from _limit(compiled, joint, at, names)
-    elif any(numbers.values()):
+        return
+    if joint.kind == "ball":
+        yield from _ball_limit(compiled, link, joint, names)
+    if any(numbers.values()):
         elements, coordinates = _freedoms(compiled, link, joint, names)
         yield from elements
         for freedom in coordinates:
             yield from _along(f"{label} {freedom.name}", freedom, numbers, 0.0, names)
+
+
+def gravity_compensation(
+    compiled: Compiled, links: tuple[Link, ...], names: Names
+) -> Iterator[Force]:
+    """Yields the force −c m g at the center of mass of each body with gravity compensation c.
+
+    m is the mass of the body and g the gravitational acceleration. MuJoCo applies no compensation
+    if both springs and dampers are disabled.
+    """
+    m = compiled.model
+    if compiled.disabled("gravity", "gravcomp") or not has_passive_forces(compiled):
+        return
+    for body in map(int, np.flatnonzero(m.body_gravcomp)):
+        link = scene_body(compiled, links, body)
+        if link != WORLD:
+            name = names.take(f"{compiled.name('body', body)} gravcomp", "force")
+            force = -m.body_gravcomp[body] * m.body_mass[body] * m.opt.gravity
+            yield Force(name, link, force, compiled.data.xipos[body])
+
+
+def has_passive_forces(compiled: Compiled) -> bool:
+    """Returns False if springs and dampers are disabled; MuJoCo then has no passive forces."""
+    return not (compiled.disabled("spring") and compiled.disabled("damper"))
+
+
+def fluid_drag(compiled: Compiled, links: tuple[Link, ...], names: Names) -> Iterator[FluidDrag]:
+    """Yields the drag of the fluid on the inertia box of each body.
+
+    The box has the mass and the inertia of the body: bᵢ² = 6 (Iⱼ + Iₖ − Iᵢ)/m.
+    """
+    m = compiled.model
+    fluid = m.opt.density, m.opt.viscosity
+    if not any(fluid) or compiled.disabled("fluid") or not has_passive_forces(compiled):
+        return
+    for body in range(1, m.nbody):
+        link, mass = scene_body(compiled, links, body), m.body_mass[body]
+        if link == WORLD or mass < SMALLEST:
+            continue
+        moments = m.body_inertia[body]
+        squares = np.maximum(moments.sum() - 2 * moments, SMALLEST) * 6 / mass
+        turn = np.zeros(4)
+        compiled.mujoco.mju_mat2Quat(turn, compiled.data.ximat[body])
+        yield FluidDrag(
+            names.take(f"{compiled.name('body', body)} drag", "force"),
+            link,
+            np.sqrt(squares),
+            *fluid,
+            wind=m.opt.wind,
+            point=compiled.data.xipos[body],
+            orientation=turn,
+        )
 
 
 def _along(
@@ -95,6 +160,19 @@ def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -
     lower, upper = m.jnt_range[joint.id] - m.qpos0[joint.q] + inward
     name = names.take(f"{compiled.name('joint', joint.id)} limit", "limit")
     yield Limit(name, at.joint, lower, upper, at.name)
+
+
+def _ball_limit(
+    compiled: Compiled, link: Link, joint: LinkJoint, names: Names
+) -> Iterator[RotationAngle | Limit]:
+    """Yields the limit of the rotation angle of a ball joint, if it has one, and its coordinate."""
+    m, label = compiled.model, compiled.name("joint", joint.id)
+    if compiled.disabled("limit", "ball_limit", "constraint") or not m.jnt_limited[joint.id]:
+        return
+    name = names.take(f"{label} angle", "angle")
+    yield RotationAngle(name, link.above, link.name, compiled.data.xanchor[joint.id])
+    upper = m.jnt_range[joint.id].max() - m.jnt_margin[joint.id]
+    yield Limit(names.take(f"{label} limit", "limit"), name, upper=upper)
 
 
 def _freedoms(

@@ -14,6 +14,9 @@ from jaxcon.io.pairs import GeomPair
 ZERO = (
     ("joint", "jnt_stiffnesspoly", "polynomial stiffness"),
     ("joint", "jnt_springyield", "a spring that yields"),
+    ("tendon", "tendon_stiffnesspoly", "polynomial stiffness"),
+    ("tendon", "tendon_dampingpoly", "polynomial damping"),
+    ("tendon", "tendon_springyield", "a spring that yields"),
     ("actuator", "actuator_damping", "damping"),
     ("actuator", "actuator_dampingpoly", "polynomial damping"),
     ("actuator", "actuator_armature", "armature"),
@@ -28,56 +31,25 @@ def shapes(compiled: Compiled) -> list[str]:
     return [_described(compiled, p) for p in unknown]
 
 
-def torsion(compiled: Compiled) -> list[str]:
-    """Returns the names of all pairs of geoms with torsional or rolling friction."""
-    listed = [p for p in pairs.pairs(compiled) if p.condim > 3 and pairs.supported(compiled, p)]
-    return [pairs.label(compiled, p) for p in listed]
-
-
-def ball_limits(compiled: Compiled) -> list[str]:
-    """Returns the names of all ball joints with limits."""
-    m = compiled.model
-    if compiled.disabled("limit", "constraint"):
-        return []
-    balls = m.jnt_type == int(compiled.mujoco.mjtJoint.mjJNT_BALL)
-    return _named(compiled, "joint", m.jnt_limited.astype(bool) & balls)
-
-
-def tendons(compiled: Compiled) -> list[str]:
-    """Returns the names of all tendons with forces or limits; other tendons are only sensors."""
-    m = compiled.model
-    fields = ["stiffness", "damping", "armature"]
-    fields += [] if compiled.disabled("limit", "constraint") else ["limited"]
-    rubs = not compiled.disabled("friction", "frictionloss", "constraint")
-    fields += ["frictionloss"] if rubs else []
-    arrays = [np.asarray(getattr(m, f"tendon_{f}", np.zeros(m.ntendon))) != 0 for f in fields]
-    return _named(compiled, "tendon", np.any(arrays, axis=0))
-
-
-def fluid(compiled: Compiled) -> list[str]:
-    """Returns the names of the nonzero fluid options, "density" and "viscosity"."""
-    options = compiled.model.opt
-    return [f for f in ("density", "viscosity") if getattr(options, f)]
-
-
-def gravity_compensation(compiled: Compiled) -> list[str]:
-    """Returns the names of all bodies with gravity compensation."""
-    return _named(compiled, "body", compiled.model.body_gravcomp)
+def mocap_bodies(compiled: Compiled) -> list[str]:
+    """Returns the names of all mocap bodies."""
+    return _named(compiled, "body", compiled.model.body_mocapid >= 0)
 
 
 REFUSED: dict[str, tuple[str, Callable[[Compiled], list[str]]]] = {
     "shape": ("contacts between", shapes),
-    "torsion": ("the torsional and rolling friction of", torsion),
-    "ball_limit": ("the limits of", ball_limits),
-    "tendon": ("the tendons", tendons),
-    "fluid": ("the option", fluid),
-    "gravcomp": ("the gravcomp of", gravity_compensation),
+    "mocap": ("motions of the mocap bodies", mocap_bodies),
 }
 """The unsupported features that `ignore` may leave out.
 
 Each entry has a description and a function that returns the names of the objects with the feature.
 """
-IGNORABLE = ("contact", "self_contact", "limit", "friction", *REFUSED)
+IGNORABLE = (
+    *("contact", "self_contact", "torsion", "limit", "ball_limit", "friction", "gravcomp"),
+    *("tendon", "fluid"),
+    *REFUSED,
+)
+"""The values that the argument `ignore` of `from_mjcf` may have."""
 
 
 def left_out(ignore: tuple[str, ...]) -> frozenset[str]:
@@ -116,10 +88,12 @@ def refuse(compiled: Compiled) -> None:
 def _unsupported(compiled: Compiled) -> Iterable[str]:
     """Yields descriptions of the unsupported features that `ignore` cannot leave out."""
     m = compiled.model
-    for count, what in (("nflex", "flex"), ("nmocap", "mocap body"), ("nplugin", "plugin")):
+    for count, what in (("nflex", "flex"), ("nplugin", "plugin")):
         if getattr(m, count):
             yield f"a {what}, of which there are {getattr(m, count)},"
     for kind, field, what in ZERO:
+        if kind == "tendon" and compiled.disabled("tendon"):
+            continue
         for name in _named(compiled, kind, getattr(m, field, ())):
             yield f"{what} of {kind} '{name}'"
     if np.any(getattr(m, "dof_dampingpoly", 0.0)):
@@ -128,6 +102,14 @@ def _unsupported(compiled: Compiled) -> Iterable[str]:
         yield "the flag actuation='disable' of a model with actuators"
     if m.opt.disableactuator:
         yield "the option actuatorgroupdisable"
+    if (m.opt.density or m.opt.viscosity) and not compiled.disabled("fluid"):
+        for name in _named(compiled, "geom", m.geom_fluid[:, :1]):
+            yield f"fluidshape of geom '{name}'"
+    if m.body_gravcomp.any() and not compiled.disabled("gravcomp"):
+        for name in _named(compiled, "joint", m.jnt_actgravcomp * m.jnt_actfrclimited):
+            yield f"actuatorgravcomp of joint '{name}' beside an actuatorfrcrange"
+        for name in _named(compiled, "joint", m.jnt_actgravcomp * (m.nu == 0)):
+            yield f"actuatorgravcomp of joint '{name}' in a model without actuators"
     yield from _unsupported_contacts(compiled)
 
 
@@ -145,7 +127,10 @@ def _unsupported_contacts(compiled: Compiled) -> Iterable[str]:
     if contacts and np.any(getattr(m, "pair_adhesion", 0.0)):
         yield "adhesion of a pair"
     for pair in contacts:
-        if pair.condim > 1 and pair.friction[0] != pair.friction[1]:
+        sliding, rolling = pair.friction[:2], pair.friction[3:]
+        directed = pair.condim > 1 and sliding[0] != sliding[1]
+        rolls = pair.condim == 6 and "torsion" not in compiled.ignored
+        if directed or (rolls and rolling[0] != rolling[1]):
             yield f"friction that depends on the direction, of {_described(compiled, pair)},"
 
 

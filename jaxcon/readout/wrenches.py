@@ -123,12 +123,12 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
         snapshot = system.snapshot(state.q, state.v, state.instant)
         group, anchors = getattr(system, kind)[index], None
         if kind == "constraints":
-            pulls = _of_equalities(snapshot, group, layout, multipliers)
+            pulls = equality_pulls(snapshot, group, layout, multipliers)
         elif kind == "bounds":
             assert reactions is not None
             dt = jnp.ones_like(state.time)  # any value: directions of forces do not depend on it
             rows = group.bounds(snapshot, control, dt)
-            pulls, anchors = _of_inequalities(group, rows, reactions), rows.place
+            pulls, anchors = inequality_pulls(group, rows, reactions), rows.place
             if rows.points is not None:
                 return [*_wrenches(snapshot, pulls, None)]
         else:
@@ -158,7 +158,7 @@ def _reader(kind: str, index: int, layout: RowLayout) -> Callable[..., list[Arra
     return read
 
 
-def _of_equalities(
+def equality_pulls(
     snapshot: Snapshot, group: Constraint, layout: RowLayout, multipliers: Array
 ) -> list[Pull]:
     """Returns the generalized forces Jᵀλ of constraints, for each side whose bodies move."""
@@ -171,7 +171,7 @@ def _of_equalities(
     return [(place, _sum(λ, [row.pulls[side] for row in rows])) for side, place in moving]
 
 
-def _of_inequalities(group: Any, rows: BoundSet, reactions: Reactions) -> list[Pull]:
+def inequality_pulls(group: Any, rows: BoundSet, reactions: Reactions) -> list[Pull]:
     """Returns the generalized forces Jᵀλ of inequality rows, for each side whose bodies move.
 
     The forces at all contact points of an element are added.

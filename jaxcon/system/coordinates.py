@@ -72,6 +72,12 @@ class JointCoordinate:
         rows |= group.select(joints).coordinate_rows(snapshot, self.name)
         return joints, rows[self.name]
 
+    def select(self, indices: tuple[int, ...]) -> JointCoordinate:
+        """Returns the coordinates of some of the elements."""
+        joints = tuple(self.joints[i] for i in indices)
+        counters = tuple(self.counters[i] for i in indices) if self.counters else ()
+        return JointCoordinate(self.group, joints, self.name, counters)
+
     def rate(self, snapshot: Snapshot, row: Row, v: Array) -> Lane:
         """Returns the rate θ̇ of the coordinate for other velocities at the same positions.
 

@@ -50,6 +50,9 @@ class Element:
     """The fields in the frame of the second body, besides fields whose names end in `_b`."""
     by_principal_axes: ClassVar[bool] = False
     """True if the element depends on the principal axes of its bodies, which must not change."""
+    repeats: ClassVar[bool] = False
+    """True if several bodies of the element may be the same one; its coordinate is then used by
+    tendons only."""
     controls: Any = 0
     """The number of control inputs."""
     counts: ClassVar[bool] = True
