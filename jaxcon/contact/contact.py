@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.joints import POSITIVE_LENGTH, stretched, unit_vector
@@ -265,6 +266,8 @@ class Contacts(Ranged):
     def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
         """Returns the inequality rows at one instant, with their targets for a step of dt."""
         p, places = self.params, self.places
+        if hasattr(self.law, "touches"):
+            return self._shape_bounds(snapshot, dt)
         points = self.law.points(p) if hasattr(self.law, "points") else None
         if points is not None:
             p = spread(p, points)
@@ -272,6 +275,26 @@ class Contacts(Ranged):
         rows, fields = self.law.bounds(p, *(snapshot.frame(place) for place in places), dt)
         law = "contact" if "friction" in p else "single"
         each = None if points is None else points[0].shape[1]
+        return BoundSet(law, tuple(rows), places, points=each, **fields)
+
+    def _shape_bounds(self, snapshot: Snapshot, dt: Array) -> BoundSet:
+        """Returns the rows of shapes, whose contact points are functions of the poses."""
+        p, places = self.params, self.places
+        gap, *vectors = self.law.touches(p, *(snapshot.frame(place) for place in places))
+        count = gap.shape[1]
+
+        def flat(x: Array) -> Array:
+            return x.reshape(-1, *x.shape[2:])
+
+        given = {name: x for name, x in p.items() if isinstance(x, jax.Array)}
+        if count > 1:
+            given = {name: jnp.repeat(x, count, axis=0) for name, x in given.items()}
+            places = tuple(spread_place(place, count) for place in places)
+        normal, place = (v.map(flat) for v in vectors)
+        a, b = (snapshot.frame(place) for place in places)
+        rows, fields = contact_rows(given, Touch(flat(gap), normal, place, a, b), dt)
+        law = "contact" if "friction" in p else "single"
+        each = None if count == 1 else count
         return BoundSet(law, tuple(rows), places, points=each, **fields)
 
 
