@@ -37,7 +37,7 @@ GAPS: Mapping[tuple[type[Shape], type[Shape]], Callable[[Solid, Solid], list[Gap
             (Plane, Sphere): solids.plane_ball,
             (Plane, Capsule): solids.plane_capsule,
             (Plane, Cylinder): solids.plane_cylinder,
-            (Plane, Box): solids.plane_box,
+            (Plane, Box): boxes.plane_box,
             (Plane, Ellipsoid): solids.plane_ellipsoid,
             (Plane, Hull): solids.plane_hull,
             (Box, Sphere): solids.box_ball,
@@ -99,18 +99,21 @@ class ShapePair:
 
         Args:
             p: the numbers of the elements by name.
-            a, b: the motion of the bodies.
+            a: the motion of the first bodies.
+            b: the motion of the second bodies.
         """
         first, second = self.first.solid(p, "a", a), self.second.solid(p, "b", b)
         kinds = self.first, self.second
         if kinds in GAPS:
             gaps = GAPS[kinds](first, second)
         else:
-            gaps = [gap.swapped() for gap in GAPS[kinds[::-1]](second, first)]
+            gaps = [gap.swapped() for gap in GAPS[self.second, self.first](second, first)]
         if len(gaps) == 1 and Hull in kinds:  # already lanes (element, k, …)
             gap, normal, place = gaps[0]
             shape = jnp.shape(gap)
-            normal, place = (Vector(*(jnp.broadcast_to(x, shape) for x in v)) for v in (normal, place))
+            normal, place = (
+                Vector(*(jnp.broadcast_to(x, shape) for x in v)) for v in (normal, place)
+            )
         else:
             gap = solids.stack_points([x.distance for x in gaps])
             normal, place = (
@@ -133,11 +136,11 @@ class ShapeContact(BetweenBodies):
         ==========  =====  ======  =======  ========  ===  =========  ====
         shape       Plane  Sphere  Capsule  Cylinder  Box  Ellipsoid  Hull
         ==========  =====  ======  =======  ========  ===  =========  ====
-        Plane              1       2        5         8    1          all
+        Plane              1       2        5         4    1          all
         Sphere      1                       1         1    1
         Capsule     2                       3         2
         Cylinder    5      1       3
-        Box         8      1       2                  4
+        Box         4      1       2                  4
         Ellipsoid   1      1
         Hull        all
         ==========  =====  ======  =======  ========  ===  =========  ====

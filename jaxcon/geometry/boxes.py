@@ -1,4 +1,6 @@
-"""Contact of two boxes at up to four points, by separating axes and clipping of faces.
+"""Contact of boxes with planes and with each other, at up to four points.
+
+Two boxes touch along their best separating axis, where one face is clipped to another.
 
 References:
     Gottschalk, Lin, Manocha, OBBTree: a hierarchical structure for rapid interference detection,
@@ -17,7 +19,17 @@ import jax.numpy as jnp
 from jaxcon.core import numerics
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import Array, Lane
-from jaxcon.geometry.solids import Gap, Solid, per_point, sign, stack_points, where
+from jaxcon.geometry.solids import (
+    Gap,
+    Solid,
+    from_plane,
+    largest,
+    per_point,
+    pick,
+    sign,
+    stack_points,
+    where,
+)
 
 POINTS = 4
 """The number of contact points of two boxes."""
@@ -77,6 +89,16 @@ class _Points(NamedTuple):
     valid: Array
 
 
+def plane_box(plane: Solid, box: Solid) -> list[Gap]:
+    """Returns the gaps between a plane and the corners of the box's face that is most parallel.
+
+    These are the lowest corner and its neighbors. Every other corner is higher than one of them.
+    """
+    middle, first, second = _facing(box, plane.axis)
+    corners = [middle + first * s + second * t for s, t in CORNERS]
+    return [from_plane(plane, corner, 0.0) for corner in corners]
+
+
 def box_box(a: Solid, b: Solid) -> list[Gap]:
     """Returns the gaps between two boxes at four points.
 
@@ -120,22 +142,9 @@ def _least(lanes: Sequence[Lane]) -> Lane:
     return result
 
 
-def _one_hot(scores: Array) -> Array:
-    """Marks the largest entry along the axis of points, the first one of equal entries."""
-    shape = (1, scores.shape[1], *(1,) * (scores.ndim - 2))
-    places = jnp.arange(scores.shape[1], dtype=jnp.int32).reshape(shape)
-    return places == jnp.expand_dims(jnp.argmax(scores, axis=1).astype(jnp.int32), 1)
-
-
-def _pick(marks: Array, lanes: Array | Sequence[Lane]) -> Array:
-    """Returns the marked one of several lanes."""
-    stacked = lanes if not isinstance(lanes, Sequence) else stack_points(lanes)
-    return jnp.sum(jnp.where(marks, stacked, 0), axis=1)
-
-
 def _pick_vector(marks: Array, vectors: Sequence[Vector]) -> Vector:
     """Returns the marked one of several vectors."""
-    return Vector(*(_pick(marks, lanes) for lanes in zip(*vectors, strict=True)))
+    return Vector(*(pick(marks, lanes) for lanes in zip(*vectors, strict=True)))
 
 
 def _turned(items: Sequence, by: int) -> list:
@@ -149,22 +158,28 @@ def _reference_face(a: Solid, b: Solid, smallest: Lane) -> _Face:
     cosines = [[u.dot(w) for w in b.axes] for u in a.axes]
     along = [u.dot(offset) for u in (*a.axes, *b.axes)]
     reach = [
-        h + sum((abs(c) * g for c, g in zip(row[1:], b.half[1:], strict=True)), abs(row[0]) * b.half[0])
+        h
+        + sum(
+            (abs(c) * g for c, g in zip(row[1:], b.half[1:], strict=True)), abs(row[0]) * b.half[0]
+        )
         for h, row in zip(a.half, cosines, strict=True)
     ]
     columns = list(zip(*cosines, strict=True))
     reach += [
-        h + sum((abs(c) * g for c, g in zip(row[1:], a.half[1:], strict=True)), abs(row[0]) * a.half[0])
+        h
+        + sum(
+            (abs(c) * g for c, g in zip(row[1:], a.half[1:], strict=True)), abs(row[0]) * a.half[0]
+        )
         for h, row in zip(b.half, columns, strict=True)
     ]
     separations = [abs(d) - r for d, r in zip(along, reach, strict=True)]
     bias = FIRST_BOX * smallest
-    marks = _one_hot(stack_points([s + bias for s in separations[:3]] + separations[3:]))
+    marks = largest(stack_points([s + bias for s in separations[:3]] + separations[3:]))
     axes, halves = [*a.axes, *b.axes], [*a.half, *b.half]
     normal = _pick_vector(marks, axes)
-    half = _pick(marks, halves)
+    half = pick(marks, halves)
     of_second = jnp.any(marks[:, 3:], axis=1)
-    toward = _pick(marks, along[:3] + [-x for x in along[3:]])
+    toward = pick(marks, along[:3] + [-x for x in along[3:]])
     normal = normal * sign(toward)
     other = Solid(
         where(of_second, a.center, b.center),
@@ -176,10 +191,10 @@ def _reference_face(a: Solid, b: Solid, smallest: Lane) -> _Face:
         _pick_vector(marks, _turned(axes, 1)),
         _pick_vector(marks, _turned(axes, 2)),
         where(of_second, b.center, a.center) + normal * half,
-        _pick(marks, _turned(halves, 1)),
-        _pick(marks, _turned(halves, 2)),
+        pick(marks, _turned(halves, 1)),
+        pick(marks, _turned(halves, 2)),
         of_second,
-        _pick(marks, separations),
+        pick(marks, separations),
         other,
     )
 
@@ -188,19 +203,15 @@ def _edges(a: Solid, b: Solid) -> tuple[Gap, Lane]:
     """Returns the contact of the two edges whose common normal separates two boxes best.
 
     Returns:
-        The gap, and the separation along the normal; −∞ as a large negative number if no edges
-        cross.
+        The gap, and the separation along the normal. For parallel edges it is below that of faces.
     """
     offset = b.center - a.center
     c = [[u.dot(w) for w in b.axes] for u in a.axes]
     d = [u.dot(offset) for u in a.axes]
-    separations, directions, squares = [], [], []
     pairs = list(itertools.product(range(3), repeat=2))
-    following = {0: (1, 2), 1: (2, 0), 2: (0, 1)}
-    first, second = ([following[i][k] for i, _ in pairs] for k in (0, 1))
-    third, fourth = ([following[j][k] for _, j in pairs] for k in (0, 1))
-    of = [i for i, _ in pairs]
-    to = [j for _, j in pairs]
+    of, to = ([pair[k] for pair in pairs] for k in (0, 1))
+    first, second = ([(i + k) % 3 for i in of] for k in (1, 2))
+    third, fourth = ([(j + k) % 3 for j in to] for k in (1, 2))
 
     def each(lanes: list[Lane], places: list[int]) -> Array:
         return stack_points([lanes[i] for i in places])
@@ -208,7 +219,6 @@ def _edges(a: Solid, b: Solid) -> tuple[Gap, Lane]:
     def cosine(rows: list[int], columns: list[int]) -> Array:
         return stack_points([c[i][j] for i, j in zip(rows, columns, strict=True)])
 
-    del separations, directions, squares
     second_c, first_c = cosine(second, to), cosine(first, to)
     along = each(d, second) * first_c - each(d, first) * second_c
     a_half, b_half = list(a.half), list(b.half)
@@ -220,7 +230,7 @@ def _edges(a: Solid, b: Solid) -> tuple[Gap, Lane]:
     length = jnp.sqrt(jnp.where(crosses, square, 1))
     size = per_point(sum(a.half[1:], a.half[0]) + sum(b.half[1:], b.half[0]))
     separation = jnp.where(crosses, (abs(along) - reach) / length, -2 * size)
-    marks = _one_hot(separation)
+    marks = largest(separation)
     u = [jnp.any(marks[:, 3 * i : 3 * i + 3], axis=1) for i in range(3)]
     w = [jnp.any(marks[:, j::3], axis=1) for j in range(3)]
     edge_a = _chosen(u, a.axes)
@@ -241,7 +251,7 @@ def _edges(a: Solid, b: Solid) -> tuple[Gap, Lane]:
     s = jnp.clip((p - cos * q) * scale, -half_a, half_a)
     t = jnp.clip((cos * p - q) * scale, -half_b, half_b)
     place = (start + edge_a * s + end + edge_b * t) * 0.5
-    return Gap(normal.dot(apart), normal, place), jnp.max(separation, axis=1)
+    return Gap(normal.dot(apart), normal, place), pick(marks, separation)
 
 
 def _chosen(marks: Sequence[Lane], vectors: Sequence[Vector]) -> Vector:
@@ -254,21 +264,29 @@ def _chosen_lane(marks: Sequence[Lane], lanes: Sequence[Lane]) -> Lane:
     return jnp.where(marks[0], lanes[0], jnp.where(marks[1], lanes[1], lanes[2]))
 
 
+def _facing(box: Solid, normal: Vector) -> tuple[Vector, Vector, Vector]:
+    """Returns the face of a box whose outward normal is most opposite to a direction.
+
+    Returns:
+        The center of the face, and half its edges, as vectors in the world frame.
+    """
+    cosines = [u.dot(normal) for u in box.axes]
+    marks = largest(stack_points([abs(c) for c in cosines]))
+    side = -sign(pick(marks, cosines))
+    axes, halves = list(box.axes), list(box.half)
+    center = box.center + _pick_vector(marks, axes) * (side * pick(marks, halves))
+    first = _pick_vector(marks, _turned(axes, 1)) * pick(marks, _turned(halves, 1))
+    return center, first, _pick_vector(marks, _turned(axes, 2)) * pick(marks, _turned(halves, 2))
+
+
 def _clipped(face: _Face) -> _Points:
     """Clips the incident face of the other box to the sides of the reference face.
 
     The candidates are the starts and ends of the four clipped edges of the incident face, and the
     corners of the reference face that lie within it.
     """
-    other = face.other
-    cosines = [u.dot(face.normal) for u in other.axes]
-    marks = _one_hot(stack_points([abs(c) for c in cosines]))
-    side = -sign(_pick(marks, cosines))
-    axes, halves = list(other.axes), list(other.half)
-    center = other.center + _pick_vector(marks, axes) * (side * _pick(marks, halves))
+    center, first, second = _facing(face.other, face.normal)
     frame = (face.x, face.y, face.normal)
-    first = _pick_vector(marks, _turned(axes, 1)) * _pick(marks, _turned(halves, 1))
-    second = _pick_vector(marks, _turned(axes, 2)) * _pick(marks, _turned(halves, 2))
     middle, p, q = (
         Vector(*(per_point(u.dot(v)) for u in frame)) for v in (center - face.center, first, second)
     )
@@ -313,7 +331,7 @@ def _clipped(face: _Face) -> _Points:
     )
     # an overlap that clipping misses: the lowest corner of the incident face
     none = ~jnp.any(valid, axis=1, keepdims=True) & (per_point(face.separation) <= 0)
-    lowest = _one_hot(-corner[2])
+    lowest = largest(-corner[2])
     corners = jnp.concatenate([lowest, jnp.zeros_like(lowest), jnp.zeros_like(lowest)], axis=1)
     xs, ys, zs = (
         jnp.where(none, jnp.concatenate([c, c, c], axis=1), x)
@@ -333,11 +351,11 @@ def _spread(points: _Points) -> list[tuple[Lane, Lane, Lane, Lane]]:
     chosen = []
 
     def add(score: Array, least: Lane | None = None) -> tuple[Lane, Lane]:
-        marks = _one_hot(jnp.where(valid, score, -far))
+        marks = largest(jnp.where(valid, score, -far))
         exists = jnp.any(marks & valid, axis=1)
         if least is not None:
             exists &= jnp.max(jnp.where(valid, score, -far), axis=1) > least
-        at = [_pick(marks, lanes) for lanes in (x, y, z)]
+        at = [pick(marks, lanes) for lanes in (x, y, z)]
         chosen.append((*at, exists))
         return at[0], at[1]
 
@@ -347,7 +365,7 @@ def _spread(points: _Points) -> list[tuple[Lane, Lane, Lane, Lane]]:
     x1, y1 = (per_point(c) for c in add(square, 0.0))
     ux, uy = x1 - x0, y1 - y0
     area = ux * dy - uy * dx
-    tiny = 1e-6 * (ux * ux + uy * uy)[:, 0]
+    tiny = 1e-6 * jnp.max(ux * ux + uy * uy, axis=1)
     add(area, tiny)
     add(-area, tiny)
     return chosen

@@ -46,6 +46,7 @@ class Solid(NamedTuple):
     axes: tuple[Vector, ...] = ()
     radius: Any = 0.0
     half: Any = 0.0
+    points: Any = None
 
     @property
     def axis(self) -> Vector:
@@ -108,14 +109,6 @@ def plane_capsule(plane: Solid, capsule: Solid) -> list[Gap]:
     along = capsule.axis * capsule.half
     ends = capsule.center - along, capsule.center + along
     return [from_plane(plane, end, capsule.radius) for end in ends]
-
-
-def plane_box(plane: Solid, box: Solid) -> list[Gap]:
-    """Returns the gaps between a plane and the eight corners of a box."""
-    x, y, z = (u * h for u, h in zip(box.axes, box.half, strict=True))
-    steps = (-1.0, 1.0)
-    corners = [box.center + x * i + y * j + z * k for i in steps for j in steps for k in steps]
-    return [from_plane(plane, corner, 0.0) for corner in corners]
 
 
 def plane_hull(plane: Solid, hull: Solid) -> list[Gap]:
@@ -261,15 +254,15 @@ def ellipsoid_ball(ellipsoid: Solid, ball: Solid) -> list[Gap]:
         return jnp.maximum(t + step, lowest)
 
     fixed = jax.lax.stop_gradient((p, squares, lowest))
-    starts = [
-        jnp.sqrt(s) * abs(x) - s for s, x in zip(fixed[1], fixed[0], strict=True)
-    ]
+    starts = [jnp.sqrt(s) * abs(x) - s for s, x in zip(fixed[1], fixed[0], strict=True)]
     start = jnp.maximum(jnp.maximum(starts[0], starts[1]), jnp.maximum(starts[2], fixed[2]))
     t = jax.lax.fori_loop(0, ELLIPSOID_STEPS, lambda _, t: newton(t, *fixed), start)
     t = jax.lax.stop_gradient(t)
     for _ in range(2):  # exact first and second derivatives of t
         t = newton(t, p, squares, lowest)
-    direction = Vector(*(x * numerics.safe_divide(1.0, s + t) for x, s in zip(p, squares)))
+    direction = Vector(
+        *(x * numerics.safe_divide(1.0, s + t) for x, s in zip(p, squares, strict=True))
+    )
     length = numerics.norm(direction)
     normal = direction * numerics.safe_divide(1.0, length)
     normal = where(length > 0, normal, Vector(0.0, 0.0, 1.0))
@@ -310,17 +303,16 @@ def box_capsule(box: Solid, capsule: Solid) -> list[Gap]:
         m, s, h = (per_point(x) for x in (m, s, h))
         at = m + s * t
         rise = rise + s * (at - jnp.clip(at, -h, h))
-    low, high = rise <= 0, rise >= 0
-    before = jnp.max(jnp.where(low, t, -1), axis=1)
-    after = jnp.min(jnp.where(high, t, 1), axis=1)
-    falling = -jnp.max(jnp.where(low, rise, -jnp.inf), axis=1)
-    rising = jnp.min(jnp.where(high, rise, jnp.inf), axis=1)
-    between = (before < after) & (falling > 0) & (falling < jnp.inf) & (rising < jnp.inf)
-    falling, rising = jnp.where(between, falling, 0), jnp.where(between, rising, 1)
-    nearest = jnp.where(
-        between, before + (after - before) * falling / (falling + rising), jnp.minimum(before, after)
-    )
-    nearest = jnp.where(jnp.any(low, axis=1), nearest, -1)
+    # not `jnp.max`, whose derivative XLA may round to 0/0
+    falls, rises = rise <= 0, rise >= 0
+    before, after = (largest(jnp.where(m, x, -2)) for m, x in ((falls, t), (rises, -t)))
+    start, end = pick(before, t), jnp.where(jnp.any(rises, axis=1), pick(after, t), 1)
+    down, up = -pick(before, rise), pick(after, rise)
+    between = jnp.any(falls, axis=1) & jnp.any(rises, axis=1) & (start < end)
+    share = numerics.safe_divide(jnp.where(between, down, 0), jnp.where(between, down + up, 1))
+    # the axis may be parallel to a face, where all points between end and start are nearest
+    nearest = jnp.where(between, start + (end - start) * share, jnp.minimum(start, end))
+    nearest = jnp.where(jnp.any(falls, axis=1), nearest, -1)
     point = middle + slope * nearest
     excess = [abs(x) - h for x, h in zip(point, box.half, strict=True)]
     first = (excess[0] >= excess[1]) & (excess[0] >= excess[2])
@@ -392,7 +384,9 @@ def cylinder_capsule(cylinder: Solid, capsule: Solid) -> list[Gap]:
     start = jnp.clip(jnp.where(on_disc, disc_low, side_low), -1, 1)
     end = jnp.clip(jnp.where(on_disc, disc_high, side_high), -1, 1)
     empty = jnp.where(on_disc, disc_low > disc_high, side_low > side_high)
-    empty |= jnp.where(on_disc, (disc_low > 1) | (disc_high < -1), (side_low > 1) | (side_high < -1))
+    empty |= jnp.where(
+        on_disc, (disc_low > 1) | (disc_high < -1), (side_low > 1) | (side_high < -1)
+    )
     result = []
     for at in (t, jnp.where(empty, t, start), jnp.where(empty, t, end)):
         center = capsule.center + along * at
@@ -424,3 +418,16 @@ def stack_points(lanes: Sequence[Lane]) -> Array:
 def per_point(x: Lane) -> Lane:
     """Inserts the axis of contact points into a lane, (element, 1, …); keeps Python numbers."""
     return jnp.expand_dims(x, 1) if jnp.ndim(x) else x
+
+
+def largest(scores: Array) -> Array:
+    """Marks the largest entry along the axis of points, the first one of equal entries."""
+    shape = (1, scores.shape[1], *(1,) * (scores.ndim - 2))
+    places = jnp.arange(scores.shape[1], dtype=jnp.int32).reshape(shape)
+    return places == jnp.expand_dims(jnp.argmax(scores, axis=1).astype(jnp.int32), 1)
+
+
+def pick(marks: Array, lanes: Array | Sequence[Lane]) -> Array:
+    """Returns the marked one of several lanes."""
+    stacked = lanes if not isinstance(lanes, Sequence) else stack_points(lanes)
+    return jnp.sum(jnp.where(marks, stacked, 0), axis=1)
