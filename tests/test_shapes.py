@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
+from tolerances import DIFFERENCE
 
 import jaxcon as jc
 from jaxcon.contact import shape_contact
+from jaxcon.contact.rows import linearize_bounds
 from jaxcon.core.lanes import Vector
 from jaxcon.geometry import boxes, solids
 from jaxcon.geometry.solids import Solid
@@ -475,7 +477,7 @@ def test_a_cylinder_stands_on_its_end_and_another_one_rolls():
 
 @pytest.mark.parametrize(
     ("count", "solver"),
-    [(2, jc.solvers.InteriorPoint()), (3, jc.solvers.Newton()), (10, jc.solvers.Newton())],
+    [(2, jc.solvers.InteriorPoint()), (3, jc.solvers.Newton()), (10, jc.solvers.InteriorPoint())],
     ids=["2", "3", "10"],
 )
 def test_a_stack_of_boxes_stands(count, solver):
@@ -494,46 +496,50 @@ def test_a_stack_of_boxes_stands(count, solver):
     np.testing.assert_allclose(final.q, state.q, atol=1e-5)
 
 
-def test_gradients_of_falls_are_those_of_differences():
-    """A cylinder lands on its rim, a box on a corner, a capsule on a box and a ball on a cylinder.
+SHAPES = {
+    "corner": (Box((4.0, 4.0, 0.2)), Box((0.2, 0.2, 0.3)), (0.0, 0.0, 0.31)),
+    "side": (Cylinder(1.0, 0.2), Sphere(0.1), (0.3, 0.0, 0.206)),
+    "rim": (Plane(), Cylinder(0.1, 0.3), (0.0, 0.0, 0.186)),
+    "end": (Box((4.0, 4.0, 0.2)), Capsule(0.1, 0.3), (0.0, 0.0, 0.34)),
+}
+SIZES = {"corner": ("size_b", (0.2, 0.2, 0.3)), "side": ("radius_b", 0.1), "rim": ("length_b", 0.3)}
+SIZES |= {"end": ("length_b", 0.3)}
 
-    The derivatives of the end by the sizes, by friction and by the speed at the start.
+
+@pytest.mark.parametrize("names", [("corner",), ("side", "rim", "end")], ids=" ".join)
+def test_gradients_of_falls_are_those_of_differences(names):
+    """A box lands on a corner, a ball on a cylinder, a cylinder on its rim, a capsule on a box.
+
+    The derivatives of the end by a factor of the size, by friction and by the speed at the start.
     """
     scene = jc.Scene()
-    shapes = [
-        ("rim", Plane(), Cylinder(0.1, 0.3), (0.0, 0.0, 0.186)),
-        ("corner", Box((4.0, 4.0, 0.2)), Box((0.2, 0.2, 0.3)), (0.0, 0.0, 0.31)),
-        ("end", Box((4.0, 4.0, 0.2)), Capsule(0.1, 0.3), (0.0, 0.0, 0.34)),
-        ("side", Cylinder(1.0, 0.2), Sphere(0.1), (0.3, 0.0, 0.206)),
-    ]
-    for name, table, shape, place in shapes:
+    for name in names:
+        table, shape, place = SHAPES[name]
         inertia = jc.inertia.box(1.0, (0.2, 0.2, 0.3))
-        scene.add_body(name, inertia=inertia, position=place, quaternion=TURN)
-        ends = (jc.WORLD, name, table, shape)
-        scene.add(jc.contacts.ShapeContact(f"{name} law", *ends, friction=0.3, restitution=0.3))
+        velocity = (0.3, 0.0, -0.5)
+        scene.add_body(name, inertia=inertia, position=place, quaternion=TURN, velocity=velocity)
+        touch = {"friction": 0.2, "restitution": 0.3}
+        scene.add(jc.contacts.ShapeContact(f"{name} law", jc.WORLD, name, table, shape, **touch))
     system, state = scene.build()
-    method = jc.Method(contact_solver=jc.solvers.GaussSeidel(sweeps=60))
+    method = jc.Method()
     state = jc.init(system, method, state.q, state.v)
 
     def end(x):
-        changed = system.with_params(
-            {
-                "rim law": {"radius_b": 0.1 * x[0], "length_b": 0.3 * x[1]},
-                "corner law": {"size_b": jnp.asarray([0.2, 0.2, 0.3]) * x[2]},
-                "end law": {"friction": 0.3 * x[3], "length_b": 0.3 * x[1]},
-                "side law": {"radius_b": 0.1 * x[0]},
-            }
-        )
-        start = dataclasses.replace(state, v=state.v.at[0].set(x[4]))
-        return jnp.sum(jc.rollout(changed, method, start, None, 1e-3, 60)[0].q ** 2)
+        changes = {}
+        for name in names:
+            field, size = SIZES[name]
+            changes[f"{name} law"] = {field: jnp.asarray(size) * x[0], "friction": 0.2 * x[1]}
+        start = dataclasses.replace(state, v=state.v + x[2])
+        changed = system.with_params(changes)
+        return jnp.sum(jc.rollout(changed, method, start, None, 1e-3, 40)[0].q ** 2)
 
-    at = jnp.asarray([1.0, 1.0, 1.0, 1.0, 0.3])
-    step = 1e-6 * jnp.eye(5)
+    at = jnp.asarray([1.0, 1.0, 0.0])
+    step = 1e-6 * jnp.eye(3)
     worlds = jnp.concatenate([at[None], at[None] + step, at[None] - step])
     ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(worlds)
-    assert np.abs(slopes[0]).min() > 1e-4
-    differences = (ends[1:6] - ends[6:]) / 2e-6
-    np.testing.assert_allclose(slopes[0], differences, rtol=DIFFERENCE * 100)
+    assert np.abs(slopes[0]).min() > 1e-5
+    differences = (ends[1:4] - ends[4:]) / 2e-6
+    np.testing.assert_allclose(slopes[0], differences, rtol=100 * DIFFERENCE)
 
 
 def first_rows(element, **body):
@@ -567,7 +573,9 @@ def test_shapes_lie_where_the_body_was_given():
     size = (0.4, 0.3, 0.1)
     found, _ = first_rows(jc.contacts.ShapeContact("c", jc.WORLD, "b", Plane(), Box(size)), **body)
     heights = jc.contacts.box_corners(size, (0.1, 0.2, 1.0), TURN)[:, 2]
-    np.testing.assert_allclose(np.sort(found), np.sort(heights)[:4], atol=1e-12)
+    np.testing.assert_allclose(found.min(), heights.min(), atol=1e-12)
+    off = np.abs(found[:, None] - heights[None])
+    assert off.min(axis=1).max() < 1e-12
 
 
 @pytest.mark.parametrize(
@@ -575,7 +583,7 @@ def test_shapes_lie_where_the_body_was_given():
     [
         ({"shape_b": Box((1.0, 1.0))}, r"'c': shape_b.size must have shape \(3,\), got \(2,\)"),
         ({"shape_b": Box((1.0, 1.0, 0.0))}, "shape_b.size must be positive"),
-        ({"shape_b": Sphere(-1.0)}, "shape_b.radius must not be negative|must be at least 0"),
+        ({"shape_b": Sphere(-1.0)}, "shape_b.radius must be zero or more"),
         ({"shape_b": Sphere("1")}, "shape_b.radius must be a real number"),
         ({"shape_b": Capsule(0.1, -1.0)}, "shape_b.length"),
         ({"shape_b": Cylinder(0.0, 1.0)}, "shape_b.radius must be positive"),

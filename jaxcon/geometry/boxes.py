@@ -92,7 +92,8 @@ class _Points(NamedTuple):
 def plane_box(plane: Solid, box: Solid) -> list[Gap]:
     """Returns the gaps between a plane and the corners of the box's face that is most parallel.
 
-    These are the lowest corner and its neighbors. Every other corner is higher than one of them.
+    The lowest corner is one of them. If an edge or a face of the box is parallel to the plane, all
+    of its corners are.
     """
     middle, first, second = _facing(box, plane.axis)
     corners = [middle + first * s + second * t for s, t in CORNERS]
