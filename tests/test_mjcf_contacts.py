@@ -272,7 +272,9 @@ def test_distances_of_shapes_are_those_of_mujoco():
             assert np.sum(deep) > 5
             assert np.all(np.abs(got - want)[deep] < 0.0101 * 0.1)
         else:
-            np.testing.assert_allclose(off, 0.0, atol=1e-9, err_msg=str(pair))
+            # MuJoCo's depth of an ellipsoid is that of an iteration
+            tight = 1e-3 if pair == ("ball", "egg") else EXACT
+            np.testing.assert_allclose(off, 0.0, atol=tight, err_msg=str(pair))
 
 
 def test_shapes_touch_from_the_margin_on():
