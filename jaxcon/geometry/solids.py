@@ -298,11 +298,11 @@ def box_capsule(box: Solid, capsule: Solid) -> list[Gap]:
     places = [jnp.clip(x, -1, 1) for pair in ranges for x in pair]
     places += [jnp.full_like(places[0], -1.0), jnp.full_like(places[0], 1.0)]
     t = stack_points(places)
-    rise = 0.0
-    for m, s, h in zip(middle, slope, box.half, strict=True):
-        m, s, h = (per_point(x) for x in (m, s, h))
-        at = m + s * t
-        rise = rise + s * (at - jnp.clip(at, -h, h))
+    at = [per_point(m) + per_point(s) * t for m, s in zip(middle, slope, strict=True)]
+    halves = [per_point(h) for h in box.half]
+    beyond = [x - jnp.clip(x, -h, h) for x, h in zip(at, halves, strict=True)]
+    first, second, third = (per_point(s) * x for s, x in zip(slope, beyond, strict=True))
+    rise = jnp.asarray(first + second + third)
     # not `jnp.max`, whose derivative XLA may round to 0/0
     falls, rises = rise <= 0, rise >= 0
     before, after = (largest(jnp.where(m, x, -2)) for m, x in ((falls, t), (rises, -t)))
