@@ -23,7 +23,7 @@ from jaxcon.contact.shapes import (
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import DType, Lane
-from jaxcon.geometry import boxes, solids
+from jaxcon.geometry import boxes, cylinders, solids
 from jaxcon.geometry.pose import Pose
 from jaxcon.geometry.solids import Gap, Solid
 from jaxcon.system.elements import BetweenBodies, label
@@ -46,6 +46,8 @@ GAPS: Mapping[tuple[type[Shape], type[Shape]], Callable[[Solid, Solid], list[Gap
             (Box, Capsule): solids.box_capsule,
             (Cylinder, Capsule): solids.cylinder_capsule,
             (Box, Box): boxes.box_box,
+            (Box, Cylinder): cylinders.box_cylinder,
+            (Cylinder, Cylinder): cylinders.cylinder_cylinder,
         }
     )
 )

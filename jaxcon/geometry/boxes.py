@@ -51,16 +51,16 @@ STEADY = (1e-5, 2e-5)
 """Slopes added to the gap when the lowest point is chosen, so that rounding does not choose it."""
 
 
-class _Face(NamedTuple):
-    """The face of one box that is the reference, and the box on the other side.
+class Face(NamedTuple):
+    """The face of one solid that is the reference, and the solid on the other side.
 
     Attributes:
         normal, x, y: outward normal and the directions of the edges, world frame.
         center: center of the face.
         half_x, half_y: half the edges.
-        of_second: True if the face belongs to the second box.
-        separation: the separation of the boxes along the normal.
-        other: the other box.
+        of_second: True if the face belongs to the second solid.
+        separation: the separation of the solids along the normal.
+        other: the other solid.
     """
 
     normal: Vector
@@ -74,7 +74,7 @@ class _Face(NamedTuple):
     other: Solid
 
 
-class _Points(NamedTuple):
+class Points(NamedTuple):
     """Candidates for contact points, lanes (element, k, …).
 
     Attributes:
@@ -95,7 +95,7 @@ def plane_box(plane: Solid, box: Solid) -> list[Gap]:
     The lowest corner is one of them. If an edge or a face of the box is parallel to the plane, all
     of its corners are.
     """
-    middle, first, second = _facing(box, plane.axis)
+    middle, first, second = facing(box, plane.axis)
     corners = [middle + first * s + second * t for s, t in CORNERS]
     return [from_plane(plane, corner, 0.0) for corner in corners]
 
@@ -113,17 +113,17 @@ def box_box(a: Solid, b: Solid) -> list[Gap]:
     For boxes that overlap, the largest depth is exact up to 1 % of the smallest half edge. For
     boxes that are apart, the gap is the distance along the normal.
     """
-    smallest = _least([*a.half, *b.half])
+    smallest = least_of([*a.half, *b.half])
     face = _reference_face(a, b, smallest)
     edge, edge_separation = _edges(a, b)
     by_edge = edge_separation > face.separation + FACES_FIRST * smallest
-    points = _clipped(face)
+    points = clipped(face, *facing(face.other, face.normal))
     size = sum(a.half[1:], a.half[0]) + sum(b.half[1:], b.half[0])
     separation = jnp.maximum(face.separation, edge_separation)
     none = jnp.maximum(separation, 0) + size
     normal = where(face.of_second, -face.normal, face.normal)
     result = []
-    for k, (x, y, z, valid) in enumerate(_spread(points)):
+    for k, (x, y, z, valid) in enumerate(spread(points)):
         place = face.center + face.x * x + face.y * y + face.normal * (z / 2)
         gap = jnp.where(valid, z, none)
         if k == 0:
@@ -135,7 +135,7 @@ def box_box(a: Solid, b: Solid) -> list[Gap]:
     return result
 
 
-def _least(lanes: Sequence[Lane]) -> Lane:
+def least_of(lanes: Sequence[Lane]) -> Lane:
     """Returns the smallest of several lanes."""
     result = lanes[0]
     for x in lanes[1:]:
@@ -143,7 +143,7 @@ def _least(lanes: Sequence[Lane]) -> Lane:
     return result
 
 
-def _pick_vector(marks: Array, vectors: Sequence[Vector]) -> Vector:
+def pick_vector(marks: Array, vectors: Sequence[Vector]) -> Vector:
     """Returns the marked one of several vectors."""
     return Vector(*(pick(marks, lanes) for lanes in zip(*vectors, strict=True)))
 
@@ -153,7 +153,7 @@ def _turned(items: Sequence, by: int) -> list:
     return [items[3 * (i // 3) + (i % 3 + by) % 3] for i in range(len(items))]
 
 
-def _reference_face(a: Solid, b: Solid, smallest: Lane) -> _Face:
+def _reference_face(a: Solid, b: Solid, smallest: Lane) -> Face:
     """Returns the face that separates two boxes best."""
     offset = b.center - a.center
     cosines = [[u.dot(w) for w in b.axes] for u in a.axes]
@@ -177,7 +177,7 @@ def _reference_face(a: Solid, b: Solid, smallest: Lane) -> _Face:
     bias = FIRST_BOX * smallest
     marks = largest(stack_points([s + bias for s in separations[:3]] + separations[3:]))
     axes, halves = [*a.axes, *b.axes], [*a.half, *b.half]
-    normal = _pick_vector(marks, axes)
+    normal = pick_vector(marks, axes)
     half = pick(marks, halves)
     of_second = jnp.any(marks[:, 3:], axis=1)
     toward = pick(marks, along[:3] + [-x for x in along[3:]])
@@ -187,10 +187,10 @@ def _reference_face(a: Solid, b: Solid, smallest: Lane) -> _Face:
         tuple(where(of_second, u, w) for u, w in zip(a.axes, b.axes, strict=True)),
         half=where(of_second, a.half, b.half),
     )
-    return _Face(
+    return Face(
         normal,
-        _pick_vector(marks, _turned(axes, 1)),
-        _pick_vector(marks, _turned(axes, 2)),
+        pick_vector(marks, _turned(axes, 1)),
+        pick_vector(marks, _turned(axes, 2)),
         where(of_second, b.center, a.center) + normal * half,
         pick(marks, _turned(halves, 1)),
         pick(marks, _turned(halves, 2)),
@@ -265,7 +265,7 @@ def _chosen_lane(marks: Sequence[Lane], lanes: Sequence[Lane]) -> Lane:
     return jnp.where(marks[0], lanes[0], jnp.where(marks[1], lanes[1], lanes[2]))
 
 
-def _facing(box: Solid, normal: Vector) -> tuple[Vector, Vector, Vector]:
+def facing(box: Solid, normal: Vector) -> tuple[Vector, Vector, Vector]:
     """Returns the face of a box whose outward normal is most opposite to a direction.
 
     Returns:
@@ -275,18 +275,23 @@ def _facing(box: Solid, normal: Vector) -> tuple[Vector, Vector, Vector]:
     marks = largest(stack_points([abs(c) for c in cosines]))
     side = -sign(pick(marks, cosines))
     axes, halves = list(box.axes), list(box.half)
-    center = box.center + _pick_vector(marks, axes) * (side * pick(marks, halves))
-    first = _pick_vector(marks, _turned(axes, 1)) * pick(marks, _turned(halves, 1))
-    return center, first, _pick_vector(marks, _turned(axes, 2)) * pick(marks, _turned(halves, 2))
+    center = box.center + pick_vector(marks, axes) * (side * pick(marks, halves))
+    first = pick_vector(marks, _turned(axes, 1)) * pick(marks, _turned(halves, 1))
+    return center, first, pick_vector(marks, _turned(axes, 2)) * pick(marks, _turned(halves, 2))
 
 
-def _clipped(face: _Face) -> _Points:
-    """Clips the incident face of the other box to the sides of the reference face.
+def clipped(face: Face, center: Vector, first: Vector, second: Vector) -> Points:
+    """Clips a parallelogram of the other solid to the sides of the reference face.
 
-    The candidates are the starts and ends of the four clipped edges of the incident face, and the
+    The candidates are the starts and ends of the four clipped edges of the parallelogram, and the
     corners of the reference face that lie within it.
+
+    Args:
+        face: the reference face.
+        center: center of the parallelogram.
+        first: half of one edge; zero for a point.
+        second: half of the other edge; zero for a line.
     """
-    center, first, second = _facing(face.other, face.normal)
     frame = (face.x, face.y, face.normal)
     middle, p, q = (
         Vector(*(per_point(u.dot(v)) for u in frame)) for v in (center - face.center, first, second)
@@ -319,7 +324,7 @@ def _clipped(face: _Face) -> _Points:
     x, y = half_x * s - middle[0], half_y * t - middle[1]
     alpha = (x * q[1] - y * q[0]) * inverse
     beta = (y * p[0] - x * p[1]) * inverse
-    within = (abs(alpha) <= 1 + eps**0.5) & (abs(beta) <= 1 + eps**0.5)
+    within = (determinant != 0) & (abs(alpha) <= 1 + eps**0.5) & (abs(beta) <= 1 + eps**0.5)
     z = middle[2] + alpha * p[2] + beta * q[2]
     xs, ys, zs, valid = (
         jnp.concatenate(jnp.broadcast_arrays(*parts), axis=1)
@@ -338,10 +343,10 @@ def _clipped(face: _Face) -> _Points:
         jnp.where(none, jnp.concatenate([c, c, c], axis=1), x)
         for c, x in zip(corner, (xs, ys, zs), strict=True)
     )
-    return _Points(xs, ys, zs, valid | (none & corners))
+    return Points(xs, ys, zs, valid | (none & corners))
 
 
-def _spread(points: _Points) -> list[tuple[Lane, Lane, Lane, Lane]]:
+def spread(points: Points) -> list[tuple[Lane, Lane, Lane, Lane]]:
     """Chooses up to four points that span the contact.
 
     Returns:

@@ -92,6 +92,34 @@ def sign(x: Lane) -> Lane:
     return jnp.where(x < 0, -1.0, 1.0).astype(jnp.result_type(x))
 
 
+def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector, Lane, Array]:
+    """Returns the closest points of the segments pq and rs.
+
+    Parallel segments are closest along the part where they face each other; the result is the
+    middle of this part. If they do not face each other, the result is the two closest ends.
+
+    Returns:
+        The two points; True if the segments are not parallel; and True if they are not parallel and
+        both points lie between the ends.
+
+    References:
+        Ericson, Real-Time Collision Detection (2005), section 5.1.9.
+    """
+    u, w, d = q - p, s - r, p - r
+    a, e, b = u.dot(u), w.dot(w), u.dot(w)
+    c, f = u.dot(d), w.dot(d)
+    apart = a * e - b * b
+    tiny = 16 * float(jnp.finfo(jnp.result_type(*p)).eps)
+    skew = apart > tiny * a * e
+    x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(skew, apart, 0)), 0, 1)
+    facing = [jnp.clip(numerics.safe_divide(end, a), 0, 1) for end in (-c, b - c)]
+    x = jnp.where(skew, x, (facing[0] + facing[1]) / 2)
+    y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
+    x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
+    crossing = skew & (x > 0) & (x < 1) & (y > 0) & (y < 1)
+    return p + u * x, r + w * y, skew, crossing
+
+
 def from_plane(plane: Solid, center: Vector, radius: Lane) -> Gap:
     """Returns the gap between a plane and a ball; a ball of radius zero is a point."""
     n = plane.axis
