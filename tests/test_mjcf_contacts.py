@@ -230,6 +230,9 @@ EXACT_PAIRS = {
 }  # fmt: skip
 
 
+FACED_PAIRS = {("box", "brick"), ("cylinder", "box"), ("cylinder", "brick")}
+
+
 def solids(margin):
     """Returns a model in which all kinds of shapes may touch each other and the floor."""
     return mujoco.MjModel.from_xml_string(
@@ -241,8 +244,8 @@ def solids(margin):
 def test_distances_of_shapes_are_those_of_mujoco():
     """Compares the smallest gaps with `mj_geomDistance`, where the axis of a capsule is outside.
 
-    Boxes that overlap have MuJoCo's depth, up to 1 % of the smallest half edge. Boxes that are
-    apart have a positive gap, which is the distance along their best axis.
+    Boxes and cylinders that overlap have MuJoCo's depth, up to 1 % of the smallest half edge. If
+    they are apart, they have a positive gap, which is the distance along their best axis.
     """
     m = solids(0.0)
     read, data = jc.from_mjcf(m, ignore=("shape",)), mujoco.MjData(m)
@@ -262,11 +265,11 @@ def test_distances_of_shapes_are_those_of_mujoco():
             each[seed] = min(least, each.get(seed, np.inf))
             distance = mujoco.mj_geomDistance(m, data, *ids, 100.0, np.zeros(6))
             expected.setdefault(pair, {})[seed] = distance
-    assert found.keys() == EXACT_PAIRS | {("box", "brick")}
+    assert found.keys() == EXACT_PAIRS | FACED_PAIRS
     for pair in found:
         got, want = (np.array([x[pair][k] for k in range(40)]) for x in (found, expected))
         off = (got - want)[got > (-0.199 if "capsule" in pair else -np.inf)]
-        if pair == ("box", "brick"):
+        if pair in FACED_PAIRS:
             assert np.all(got[want > 0] > 0)
             deep = want < 0
             assert np.sum(deep) > 5

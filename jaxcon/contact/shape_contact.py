@@ -135,17 +135,17 @@ class ShapeContact(BetweenBodies):
     `Hull`. The table has the number of contact points k of each pair, in either order. Other pairs
     are refused.
 
-        ==========  =====  ======  =======  ========  ===  =========  ====
-        shape       Plane  Sphere  Capsule  Cylinder  Box  Ellipsoid  Hull
-        ==========  =====  ======  =======  ========  ===  =========  ====
-        Plane              1       2        5         4    1          all
-        Sphere      1                       1         1    1
-        Capsule     2                       3         2
-        Cylinder    5      1       3
-        Box         4      1       2                  4
-        Ellipsoid   1      1
-        Hull        all
-        ==========  =====  ======  =======  ========  ===  =========  ====
+        =========  =====  ======  =======  ========  ===  =========  ====
+        shape      Plane  Sphere  Capsule  Cylinder  Box  Ellipsoid  Hull
+        =========  =====  ======  =======  ========  ===  =========  ====
+        Plane             1       2        5         4    1          all
+        Sphere     1                       1         1    1
+        Capsule    2                       3         2
+        Cylinder   5      1       3        4         4
+        Box        4      1       2        4         4
+        Ellipsoid  1      1
+        Hull       all
+        =========  =====  ======  =======  ========  ===  =========  ====
 
     λ has the shape (k, 1 + tangents), or (1 + tangents,) for one point. A point that does not exist
     in a pose, such as three of the four points of two crossing edges, has a large gap. For spheres

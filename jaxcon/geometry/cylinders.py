@@ -87,8 +87,16 @@ def _touching(a: Solid, b: Solid) -> list[Gap]:
     mixed = Points(
         *(jnp.where(per_point(second), y, x) for x, y in zip(of_first, of_second, strict=True))
     )
-    frame = [where(second, y, x) for x, y in ((faces[0][i], faces[1][i]) for i in range(4))]
-    outward, x_axis, y_axis, center = frame
+    one, other = faces
+    outward, x_axis, y_axis, center = (
+        where(second, y, x)
+        for x, y in (
+            (one.normal, other.normal),
+            (one.x, other.x),
+            (one.y, other.y),
+            (one.center, other.center),
+        )
+    )
     normal = where(second, -outward, outward)
     none = jnp.maximum(jnp.maximum(separation, free_separation), 0) + size
     result = []
@@ -100,7 +108,7 @@ def _touching(a: Solid, b: Solid) -> list[Gap]:
             continue
         # a face that separates best without an overlap, such as a corner beyond the clipped square
         good = by_face & valid
-        use = ~by_face | (~valid & (separation <= 0))
+        use = jnp.logical_not(by_face) | (jnp.logical_not(valid) & (separation <= 0))
         gap = jnp.where(use, single.distance, jnp.where(good, gap, none))
         result.append(Gap(gap, where(use, single.normal, normal), where(use, single.place, place)))
     return result
@@ -165,15 +173,16 @@ def _faces(solid: Solid, other: Solid, of_second: bool) -> Face:
         marks = largest(stack_points(apart))
         normal = pick_vector(marks, axes) * sign(pick(marks, along))
         center = solid.center + normal * pick(marks, halves)
-        frame = [pick_vector(marks, [*axes[k:], *axes[:k]]) for k in (1, 2)]
-        edges = [pick(marks, [*halves[k:], *halves[:k]]) for k in (1, 2)]
-        return Face(normal, *frame, center, *edges, of_second, pick(marks, apart), other)
+        x, y = (pick_vector(marks, [*axes[k:], *axes[:k]]) for k in (1, 2))
+        half_x, half_y = (pick(marks, [*halves[k:], *halves[:k]]) for k in (1, 2))
+        return Face(normal, x, y, center, half_x, half_y, of_second, pick(marks, apart), other)
     along = solid.axis.dot(offset)
     normal = solid.axis * sign(along)
     side = solid.radius * 0.5**0.5
     center, apart = solid.center + normal * solid.half, abs(along) - solid.half
     separation = apart - _extent(other, solid.axis)
-    return Face(normal, *solid.axes[:2], center, side, side, of_second, separation, other)
+    x, y, _ = solid.axes
+    return Face(normal, x, y, center, side, side, of_second, separation, other)
 
 
 def _feature(solid: Solid, normal: Vector) -> tuple[Vector, Vector, Vector]:
@@ -234,7 +243,7 @@ def _best_direction(a: Solid, b: Solid) -> tuple[Vector, Lane]:
     offset = wide[1].center - wide[0].center
 
     def separation(n: Vector) -> Array:
-        return abs(n.dot(offset)) - _extent(wide[0], n) - _extent(wide[1], n)
+        return jnp.abs(n.dot(offset)) - _extent(wide[0], n) - _extent(wide[1], n)
 
     low = -4 * (_size(wide[0]) + _size(wide[1]))
     stacked = Vector(*(stack_points(x) for x in zip(*(n for n, _ in crosses), strict=True)))
