@@ -19,6 +19,7 @@ from jaxcon.core.lanes import Vector
 from jaxcon.geometry import boxes, cylinders, solids
 from jaxcon.geometry.solids import Solid
 from jaxcon.shapes import Box, Capsule, Cylinder, Ellipsoid, Hull, Plane, Sphere
+from jaxcon.staging import kernels
 
 EXACT = 1e-8
 """Tolerance of closed forms, for shapes of about a meter."""
@@ -485,8 +486,12 @@ def falls(dtype):
 
 
 @pytest.mark.parametrize("dtype", [jnp.float64, jnp.float32])
-def test_each_shape_falls_on_each_partner(dtype):
-    """The bodies fall for a second. They penetrate by less than 1 mm."""
+def test_each_shape_falls_on_each_partner(monkeypatch, dtype):
+    """The bodies fall for a second. They penetrate by less than 1 mm, and a step is a kernel."""
+    programs, write = [], kernels._program
+    monkeypatch.setattr(
+        kernels, "_program", lambda *given: programs.append(write(*given)) or programs[-1]
+    )
     system, state = falls(dtype)
     method = jc.Method()
     state = jc.init(system, method, state.q, state.v)
@@ -502,6 +507,8 @@ def test_each_shape_falls_on_each_partner(dtype):
     assert depth.dtype == dtype
     assert -1e-3 < np.min(depth) < 1e-4
     assert np.all(np.isfinite(final.q))
+    assert programs
+    assert not [x for x in programs if isinstance(x, str)]  # why there is no kernel
 
 
 def run(system, state, method, h, steps):
