@@ -91,6 +91,11 @@ class ShapePair:
             checks.check(owner, "margin", numbers["margin"], dtype=dtype, least=0)
 
     @property
+    def element(self) -> type[ShapeContact]:
+        """The class of the contacts, for summaries of a system."""
+        return ShapeContact
+
+    @property
     def supported(self) -> bool:
         """True if there is a contact of the two shapes."""
         kinds = self.first, self.second

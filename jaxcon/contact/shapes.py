@@ -117,7 +117,13 @@ class Plane(Shape):
         point = jnp.zeros(3, dtype) if self.point is None else self.point
         normal = unit_vector(element, f"{field}.normal", normal, pose)
         point = own_point(element, f"{field}.point", point, pose)
-        return {"anchor": pose.local_point(point), AXES[2]: pose.local_direction(normal)}
+        return {"anchor": pose.local_point(point), "normal": pose.local_direction(normal)}
+
+    @classmethod
+    def solid(cls, p: Mapping[str, Any], side: str, frame: BodyFrame) -> Solid:
+        """Returns the planes of many contacts in the world frame; see `Shape.solid`."""
+        normal = frame.direction(p[f"normal_{side}"]).position
+        return Solid(frame.point(p[f"anchor_{side}"]).position, (normal,))
 
 
 @dataclass(frozen=True)
