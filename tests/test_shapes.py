@@ -576,7 +576,7 @@ SIZES = {"corner": ("size_b", (0.2, 0.2, 0.3)), "side": ("radius_b", 0.1), "rim"
 SIZES |= {"end": ("length_b", 0.3)}
 
 
-@pytest.mark.parametrize("names", [("corner",), ("side", "rim", "end")], ids=" ".join)
+@pytest.mark.parametrize("names", [("side",), ("corner", "rim", "end")], ids=" ".join)
 def test_gradients_of_falls_are_those_of_differences(names):
     """A box lands on a corner, a ball on a cylinder, a cylinder on its rim, a capsule on a box.
 
