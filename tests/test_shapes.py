@@ -607,9 +607,9 @@ def test_gradients_of_falls_are_those_of_differences(names):
     step = 1e-6 * jnp.eye(3)
     worlds = jnp.concatenate([at[None], at[None] + step, at[None] - step])
     ends, slopes = jax.jit(jax.vmap(jax.value_and_grad(end)))(worlds)
-    assert np.abs(slopes[0]).min() > 1e-5
+    assert np.sort(np.abs(slopes[0]))[1] > 1e-4  # a ball that sticks does not depend on friction
     differences = (ends[1:4] - ends[4:]) / 2e-6
-    np.testing.assert_allclose(slopes[0], differences, rtol=100 * DIFFERENCE)
+    np.testing.assert_allclose(slopes[0], differences, rtol=100 * DIFFERENCE, atol=EXACT)
 
 
 def first_rows(element, **body):
