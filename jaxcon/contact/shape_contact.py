@@ -153,9 +153,9 @@ class ShapeContact(BetweenBodies):
         =========  =====  ======  =======  ========  ===  =========  ====
 
     λ has the shape (k, 1 + tangents), or (1 + tangents,) for one point. A point that does not exist
-    in a pose, such as three of the four points of two crossing edges, has a large gap. The
-    normal between two rims, or a rim and an edge, is found by a search; its derivative is left out.
-    For spheres and capsules with each other, use `CapsuleContact`. For a ball on a height field, use
+    in a pose, such as three of the four points of two crossing edges, has a large gap. The normal
+    between two rims, or a rim and an edge, is found by a search; its derivative is left out. For
+    spheres and capsules with each other, use `CapsuleContact`. For a ball on a height field, use
     `HeightFieldContact`.
 
     Attributes:
