@@ -23,6 +23,7 @@ All other names are in namespaces, whose `help` lists them.
 
     joints          joints, couplings, drives, rolling, constraints from functions
     contacts        joint limits, dry friction, ropes, contact
+    shapes          boxes, cylinders and other shapes of bodies in contact
     forces          springs, dampers, actuators, applied forces
     chains          ropes and rods of many bodies
     inertia         mass and inertia of solids
@@ -59,6 +60,7 @@ from jaxcon import (
     io,
     joints,
     learning,
+    shapes,
     solvers,
     stabilizers,
     systems,
@@ -215,6 +217,7 @@ __all__ = [
     "joints",
     "learning",
     "quaternion",
+    "shapes",
     "solvers",
     "stabilizers",
     "systems",

@@ -2,7 +2,7 @@
 
 Limits, motors and friction of joints: Limit, RateLimit, RateMotor, JointFriction.
 Ropes: Rope.
-Contact: PlaneContact, CapsuleContact, BoxContact, HeightFieldContact, box_corners.
+Contact: PlaneContact, CapsuleContact, BoxContact, ShapeContact, HeightFieldContact, box_corners.
 From a function: Inequality.
 """
 
@@ -11,6 +11,7 @@ from jaxcon.contact.contact import CapsuleContact, PlaneContact, Rope
 from jaxcon.contact.height_fields import HeightFieldContact
 from jaxcon.contact.limits import Inequality, JointFriction, Limit, RateLimit, RateMotor
 from jaxcon.contact.point_sets import box_corners
+from jaxcon.contact.shape_contact import ShapeContact
 
 
 def __dir__() -> list[str]:
@@ -27,6 +28,7 @@ __all__ = [
     "PlaneContact",
     "CapsuleContact",
     "BoxContact",
+    "ShapeContact",
     "HeightFieldContact",
     "box_corners",
     "Inequality",

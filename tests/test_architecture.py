@@ -44,6 +44,7 @@ FACADES = {
     "forces",
     "integrators",
     "joints",
+    "shapes",
     "solvers",
     "stabilizers",
     "systems",

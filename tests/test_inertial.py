@@ -163,6 +163,12 @@ def contacts_scene():
     scene.add(jc.contacts.BoxContact("box", "second", "third", friction=0.2, **box))
     scene.add(jc.contacts.HeightFieldContact("ground", "third", "first", **field))
     scene.add(jc.contacts.CapsuleContact("capsules", "first", "third", **ends))
+    place = {"position": points[4], "orientation": (0.9, 0.1, -0.2, 0.3)}
+    can, hull = jc.shapes.Cylinder(0.3, 0.8, **place), jc.shapes.Hull(points)
+    brick = jc.shapes.Box((0.3, 0.4, 0.5), points[5])
+    plane = jc.shapes.Plane((0.2, 0.1, 1.0), points[0])
+    for i, shapes in enumerate(((can, brick), (plane, hull), (brick, plane))):
+        scene.add(jc.contacts.ShapeContact(f"shapes {i}", "first", "third", *shapes))
     scene.add(
         jc.contacts.Rope(
             "rope", "first", "second", point_a=points[4], point_b=points[5], length=0.5

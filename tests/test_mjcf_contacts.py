@@ -264,3 +264,104 @@ def test_hopper_stands_on_its_foot():
     normals = jnp.mean(kinds.split(forces.T).normal, axis=1)
     np.testing.assert_allclose(jnp.sum(normals), mujoco.mj_getTotalmass(m) * 9.81, rtol=1e-6)
     assert jnp.max(residual) < 1e-6
+
+
+SOLIDS = """
+<geom name="floor" type="plane" size="1 1 1" euler="0.1 0.3 0" contype="2" conaffinity="1"/>
+<body pos="0 0 3"><freejoint/><geom name="ball" size="0.3"/></body>
+<body pos="1 0 3"><freejoint/><geom name="capsule" type="capsule" size="0.2 0.3" pos="0.1 0 0"/>
+  </body>
+<body pos="2 0 3"><freejoint/><geom name="cylinder" type="cylinder" size="0.2 0.3" euler="1 1 0"/>
+  </body>
+<body pos="3 0 3"><freejoint/><geom name="box" type="box" size="0.2 0.3 0.4" euler="0 1 0"/></body>
+<body pos="0 4 3"><freejoint/><geom name="brick" type="box" size="0.3 0.3 0.1"/></body>
+<body pos="4 0 3"><freejoint/><geom name="egg" type="ellipsoid" size="0.2 0.3 0.4"/></body>
+<body pos="5 0 3"><freejoint/><geom name="stone" type="mesh" mesh="stone"/></body>
+"""
+STONE = """<asset><mesh name="stone" vertex="0 0 0 1 0 0 0 1 0 0 0 1 1 1 0.2"/></asset>"""
+EXACT_PAIRS = {
+    ("floor", "ball"), ("floor", "capsule"), ("floor", "cylinder"), ("floor", "box"),
+    ("floor", "egg"), ("floor", "stone"), ("ball", "cylinder"), ("ball", "box"), ("ball", "egg"),
+    ("capsule", "cylinder"), ("capsule", "box"), ("ball", "brick"), ("capsule", "brick"),
+    ("floor", "brick"), ("ball", "capsule"),
+}  # fmt: skip
+
+
+FACED_PAIRS = {("box", "brick"), ("cylinder", "box"), ("cylinder", "brick")}
+
+
+def solids(margin):
+    """Returns a model in which all kinds of shapes may touch each other and the floor."""
+    return mujoco.MjModel.from_xml_string(
+        f'<mujoco><default><geom margin="{margin}"/></default>{STONE}'
+        f"<worldbody>{SOLIDS}</worldbody></mujoco>"
+    )
+
+
+def test_distances_of_shapes_are_those_of_mujoco():
+    """Compares the smallest gaps with `mj_geomDistance`, where the axis of a capsule is outside.
+
+    Boxes and cylinders that overlap have MuJoCo's depth, up to 1 % of the smallest half edge. If
+    they are apart, they have a positive gap, which is the distance along their best axis.
+    """
+    m = solids(0.0)
+    read, data = jc.from_mjcf(m, ignore=("shape",)), mujoco.MjData(m)
+    gaps = jax.jit(lambda q, v: rows(read, q, v).gap)
+    layout = rows(read, m.qpos0, np.zeros(m.nv)).layout
+    found, expected = {}, {}
+    for seed in range(40):
+        data.qpos[:] = agreement.random_states(m, 1, seed)[0][0]
+        data.qpos.reshape(-1, 7)[:, :3] *= 0.5 if seed % 2 else 0.1
+        mujoco.mj_forward(m, data)
+        gap = np.asarray(gaps(data.qpos, data.qvel))
+        for name in layout.names:
+            first, second = (x.split(" ")[0] for x in name.split(" and "))
+            pair, ids = (first, second), [m.geom(x).id for x in (first, second)]
+            least = gap[np.atleast_2d(layout.rows(name))[:, 0]].min()
+            each = found.setdefault(pair, {})
+            each[seed] = min(least, each.get(seed, np.inf))
+            distance = mujoco.mj_geomDistance(m, data, *ids, 100.0, np.zeros(6))
+            expected.setdefault(pair, {})[seed] = distance
+    assert found.keys() == EXACT_PAIRS | FACED_PAIRS
+    for pair in found:
+        got, want = (np.array([x[pair][k] for k in range(40)]) for x in (found, expected))
+        off = (got - want)[got > (-0.199 if "capsule" in pair else -np.inf)]
+        if pair in FACED_PAIRS:
+            assert np.all(got[want > 0] > 0)
+            deep = want < 0
+            assert np.sum(deep) > 5
+            assert np.all(np.abs(got - want)[deep] < 0.0101 * 0.1)
+        else:
+            # MuJoCo's depth of an ellipsoid is that of an iteration
+            tight = 1e-3 if pair == ("ball", "egg") else EXACT
+            np.testing.assert_allclose(off, 0.0, atol=tight, err_msg=str(pair))
+
+
+def test_shapes_touch_from_the_margin_on():
+    """The margin of the pair and its friction are those of MuJoCo."""
+    models = solids(0.0), solids(0.1)
+    read, v = [jc.from_mjcf(m, ignore=("shape",)) for m in models], np.zeros(models[0].nv)
+    near, far = (rows(x, m.qpos0, v) for x, m in zip(read, models, strict=True))
+    apart = near.gap - far.gap
+    exists = np.asarray(near.gap)[: near.kinds.contacts] < 50
+    want = np.where(exists, apart[0], apart[: len(exists)])
+    np.testing.assert_allclose(apart[: len(exists)], want, atol=1e-12)
+    assert apart[0] > 0.09
+    np.testing.assert_allclose(near.friction, 1.0)
+
+
+def test_a_mesh_of_many_vertices_is_reduced_with_a_warning():
+    """The message names the mesh, and tells by how much the hull exceeds the remaining points."""
+    points = np.random.default_rng(0).normal(size=(100, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    text = " ".join(map(str, points.ravel()))
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><asset><mesh name="stone" vertex="{text}"/></asset><worldbody>'
+        '<geom name="floor" type="plane" size="1 1 1"/>'
+        '<body pos="0 0 2"><freejoint/><geom name="g" type="mesh" mesh="stone"/></body>'
+        "</worldbody></mujoco>"
+    )
+    with pytest.warns(UserWarning, match="mesh 'stone' has .* use 16 of them, .* by up to 0.") as w:
+        read = jc.from_mjcf(m)
+    assert read.system.params["floor and g"]["anchor_b"].shape == (16, 3)
+    assert float(str(w[0].message).split("up to ")[1].split()[0]) < 0.3

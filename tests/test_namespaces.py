@@ -132,7 +132,7 @@ def test_a_name_of_a_namespace_raises_with_its_place():
 
 def test_every_new_place_of_a_name_is_in_the_table_or_new():
     new = {"Dopri5", "Dopri8", "Newton", "RotationAngle", "Thrust", "Tendon", "DeadBandSpring"}
-    new |= {"FluidDrag", "WrappedSpan", "Muscle"}
+    new |= {"FluidDrag", "WrappedSpan", "Muscle", "ShapeContact", *jc.shapes.__all__}
     new |= {*jc.extend.__all__} - {"Pose", "Motion", "StepInfo"}
     moved = {n.rpartition(".")[2] for n in RENAMED["names"].values()}
     in_facades = {each for module in FACADES.values() for each in module.__all__}

@@ -255,7 +255,7 @@ class Gather:
         if not moving:
             raise ValueError(f"{owner}: it acts on {list(names)}, none of which can move.")
         if self.dim not in element.dims:
-            raise ValueError(f"{owner}: this joint exists in {element.dims[0]} dimensions only.")
+            raise ValueError(f"{owner}: it exists in {element.dims[0]} dimensions only.")
         for name in names:
             if element.oriented and self.poses[name].orientation is None:
                 raise ValueError(

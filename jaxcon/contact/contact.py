@@ -12,6 +12,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 
 from jaxcon.constraints.joints import POSITIVE_LENGTH, stretched, unit_vector
@@ -26,6 +27,7 @@ from jaxcon.core.lanes import Vector
 from jaxcon.core.pytree import pytree
 from jaxcon.core.typing import Array, DType, Lane, PyTree
 from jaxcon.geometry.pose import Pose
+from jaxcon.geometry.solids import nearest
 from jaxcon.system.elements import BetweenBodies, label, own_point
 
 if TYPE_CHECKING:
@@ -265,6 +267,8 @@ class Contacts(Ranged):
     def bounds(self, snapshot: Snapshot, control: PyTree, dt: Array) -> BoundSet:
         """Returns the inequality rows at one instant, with their targets for a step of dt."""
         p, places = self.params, self.places
+        if hasattr(self.law, "touches"):
+            return self._shape_bounds(snapshot, dt)
         points = self.law.points(p) if hasattr(self.law, "points") else None
         if points is not None:
             p = spread(p, points)
@@ -272,6 +276,26 @@ class Contacts(Ranged):
         rows, fields = self.law.bounds(p, *(snapshot.frame(place) for place in places), dt)
         law = "contact" if "friction" in p else "single"
         each = None if points is None else points[0].shape[1]
+        return BoundSet(law, tuple(rows), places, points=each, **fields)
+
+    def _shape_bounds(self, snapshot: Snapshot, dt: Array) -> BoundSet:
+        """Returns the rows of shapes, whose contact points are functions of the poses."""
+        p, places = self.params, self.places
+        gap, *vectors = self.law.touches(p, *(snapshot.frame(place) for place in places))
+        count = gap.shape[1]
+
+        def flat(x: Array) -> Array:
+            return x.reshape(-1, *x.shape[2:])
+
+        given = {name: x for name, x in p.items() if isinstance(x, jax.Array)}
+        if count > 1:
+            given = {name: jnp.repeat(x, count, axis=0) for name, x in given.items()}
+            places = tuple(spread_place(place, count) for place in places)
+        normal, place = (v.map(flat) for v in vectors)
+        a, b = (snapshot.frame(place) for place in places)
+        rows, fields = contact_rows(given, Touch(flat(gap), normal, place, a, b), dt)
+        law = "contact" if "friction" in p else "single"
+        each = None if count == 1 else count
         return BoundSet(law, tuple(rows), places, points=each, **fields)
 
 
@@ -291,34 +315,6 @@ def rounding_of(ends: Sequence[Vector], x_a: Vector, x_b: Vector, radii: Lane) -
     size = functools.reduce(jnp.maximum, (abs(x) for x in (*x_a, *x_b)))
     has_axis = (q - p).dot(q - p) + (s - r).dot(s - r) > 0
     return jnp.where(has_axis, jnp.minimum(16 * eps * size, 1e-3 * radii), 0)
-
-
-def nearest(p: Vector, q: Vector, r: Vector, s: Vector) -> tuple[Vector, Vector, Lane, Array]:
-    """Returns the closest points of the segments pq and rs.
-
-    Parallel segments are closest along the part where they face each other; the result is the
-    middle of this part. If they do not face each other, the result is the two closest ends.
-
-    Returns:
-        The two points; True if the segments are not parallel; and True if they are not parallel and
-        both points lie between the ends.
-
-    References:
-        Ericson, Real-Time Collision Detection (2005), section 5.1.9.
-    """
-    u, w, d = q - p, s - r, p - r
-    a, e, b = u.dot(u), w.dot(w), u.dot(w)
-    c, f = u.dot(d), w.dot(d)
-    apart = a * e - b * b
-    tiny = 16 * float(jnp.finfo(jnp.result_type(*p)).eps)
-    skew = apart > tiny * a * e
-    x = jnp.clip(numerics.safe_divide(b * f - c * e, jnp.where(skew, apart, 0)), 0, 1)
-    facing = [jnp.clip(numerics.safe_divide(end, a), 0, 1) for end in (-c, b - c)]
-    x = jnp.where(skew, x, (facing[0] + facing[1]) / 2)
-    y = jnp.clip(numerics.safe_divide(b * x + f, e), 0, 1)
-    x = jnp.clip(numerics.safe_divide(b * y - c, a), 0, 1)
-    crossing = skew & (x > 0) & (x < 1) & (y > 0) & (y < 1)
-    return p + u * x, r + w * y, skew, crossing
 
 
 def across_axes(u: Vector, w: Vector, skew: Lane) -> Vector:

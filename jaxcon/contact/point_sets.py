@@ -75,6 +75,7 @@ def own_frame(
     pose: Pose,
     user_frame: Pose,
     names: tuple[str, str] = ("position", "orientation"),
+    given: tuple[Any, Any] | None = None,
 ) -> tuple[Array, dict[str, Array]]:
     """Returns the frame that an element fixes to its body: the origin, and the axes by name.
 
@@ -83,13 +84,14 @@ def own_frame(
             None, the user's frame of the body is used.
         pose: pose of the body's principal frame.
         user_frame: pose of the user's frame of the body, relative to the principal frame.
-        names: names of the two fields.
+        names: names of the two fields, for error messages.
+        given: the values of the two fields. If None, they are attributes of the element.
 
     Raises:
         ValueError: a field has a wrong shape, or a quaternion is zero.
     """
     owner, dim, dtype = label(element), pose.position.shape[0], pose.position.dtype
-    place, turn = (getattr(element, name) for name in names)
+    place, turn = (getattr(element, name) for name in names) if given is None else given
     origin, axes = user_frame.position, user_frame.rotation.T
     if place is not None:
         origin = pose.local_point(own_point(element, names[0], place, pose))

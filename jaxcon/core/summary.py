@@ -1,7 +1,7 @@
 """Short descriptions of large objects, for `repr`."""
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Self, TypeAlias
+from typing import Any, Self, TypeAlias
 
 import jax
 import numpy as np
@@ -39,8 +39,9 @@ def table(title: str, rows: Iterable[tuple[str, str]]) -> str:
 
 
 def of_class(x: T | type[T]) -> type[T]:
-    """Returns the class of an instance; returns a class unchanged."""
-    return x if isinstance(x, type) else type(x)
+    """Returns the class of an instance, or its attribute `element`; returns a class unchanged."""
+    kind: Any = x if isinstance(x, type) else getattr(x, "element", type(x))
+    return kind
 
 
 def by_class(elements: Iterable[tuple[type, str]]) -> list[tuple[str, str]]:

@@ -1,30 +1,111 @@
-"""Import of contacts between the planes, spheres, capsules and boxes of a MuJoCo model."""
+"""Import of contacts between the geoms of a MuJoCo model."""
 
 from __future__ import annotations
 
 import itertools
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
 from jaxcon.contact.contact import CapsuleContact, PlaneContact
+from jaxcon.contact.shape_contact import ShapeContact
+from jaxcon.contact.shapes import Box, Capsule, Cylinder, Ellipsoid, Hull, Plane, Shape, Sphere
 from jaxcon.io import pairs
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.links import Link, scene_body
 from jaxcon.io.pairs import GeomPair
 
+HULL_POINTS = 16
+"""The largest number of points by which a mesh touches a plane."""
+
+DIRECTIONS = 500
+"""The number of directions in which a mesh is compared with its points."""
+
 
 def contacts(
     compiled: Compiled, links: tuple[Link, ...], names: Names
-) -> Iterator[PlaneContact | CapsuleContact]:
+) -> Iterator[PlaneContact | CapsuleContact | ShapeContact]:
     """Yields the contacts of all supported pairs of geoms."""
     for pair in pairs.pairs(compiled):
         if not pairs.supported(compiled, pair):
             continue
         ends = [scene_body(compiled, links, int(compiled.model.geom_bodyid[g])) for g in pair[:2]]
-        flat = pairs.shapes(compiled, pair)[0] == "plane"
-        make = _on_plane if flat else _round
-        yield from make(compiled, pair, ends, names)
+        first, second = pairs.shapes(compiled, pair)
+        if first == "plane" and second in pairs.ON_PLANE:
+            yield from _on_plane(compiled, pair, ends, names)
+        elif {first, second} <= set(pairs.ROUND):
+            yield from _round(compiled, pair, ends, names)
+        else:
+            yield _of_shapes(compiled, pair, ends, names)
+
+
+def _of_shapes(compiled: Compiled, pair: GeomPair, ends: list[str], names: Names) -> ShapeContact:
+    """Returns the contact of two other shapes."""
+    first, second = (_shape(compiled, geom) for geom in pair[:2])
+    return ShapeContact(
+        names.take(pairs.label(compiled, pair), "contact"),
+        ends[0],
+        ends[1],
+        first,
+        second,
+        friction=pair.friction[0] if pair.condim > 1 else 0.0,
+        margin=pair.margin,
+    )
+
+
+def _shape(compiled: Compiled, geom: int) -> Shape:
+    """Returns the shape of a geom in the world frame."""
+    m, data = compiled.model, compiled.data
+    kind = compiled.choice("mjtGeom", m.geom_type[geom])
+    size, center = m.geom_size[geom], data.geom_xpos[geom]
+    turn = data.geom_xmat[geom].reshape(3, 3)
+    if kind == "plane":
+        return Plane(turn[:, 2], center)
+    if kind == "mesh":
+        return Hull(center + _hull_points(compiled, int(m.geom_dataid[geom])) @ turn.T)
+    if kind == "sphere":
+        return Sphere(size[0], center)
+    quaternion = np.zeros(4)
+    compiled.mujoco.mju_mat2Quat(quaternion, turn.ravel())
+    if kind == "box":
+        return Box(2 * size, center, quaternion)
+    if kind == "ellipsoid":
+        return Ellipsoid(size, center, quaternion)
+    long = {"capsule": Capsule, "cylinder": Cylinder}[kind]
+    return long(size[0], 2 * size[1], center, quaternion)
+
+
+def _hull_points(compiled: Compiled, mesh: int) -> np.ndarray:
+    """Returns the vertices of a mesh's convex hull, in the frame of the mesh, (k, 3) [m].
+
+    A hull of more than `HULL_POINTS` vertices is replaced by that many of them: in turn, the vertex
+    that lies farthest beyond the others in one of many directions.
+    """
+    m = compiled.model
+    start, count = int(m.mesh_vertadr[mesh]), int(m.mesh_vertnum[mesh])
+    vertices = np.asarray(m.mesh_vert[start : start + count], float)
+    graph = int(m.mesh_graphadr[mesh])
+    if graph >= 0:  # MuJoCo's convex hull: its number of vertices, …, and their indices
+        size = int(m.mesh_graph[graph])
+        vertices = vertices[m.mesh_graph[graph + 2 + size : graph + 2 + 2 * size]]
+    if len(vertices) <= HULL_POINTS:
+        return vertices
+    directions = np.random.default_rng(0).normal(size=(DIRECTIONS, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    heights = directions @ vertices.T
+    chosen = [int(np.argmax(heights[0]))]
+    while len(chosen) < HULL_POINTS:
+        missing = heights.max(axis=1) - heights[:, chosen].max(axis=1)
+        chosen.append(int(np.argmax(heights[np.argmax(missing)])))
+    missing = heights.max(axis=1) - heights[:, chosen].max(axis=1)
+    warnings.warn(
+        f"from_mjcf: mesh '{compiled.name('mesh', mesh)}' has {len(vertices)} vertices in its"
+        f" convex hull; contacts use {HULL_POINTS} of them, beyond which the hull extends by up to"
+        f" {missing.max():.2g} m.",
+        stacklevel=2,
+    )
+    return vertices[sorted(set(chosen))]
 
 
 def _on_plane(

@@ -7,10 +7,23 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxcon.contact import shapes as shapes_of_jaxcon
+from jaxcon.contact.shape_contact import ShapePair
 from jaxcon.io.compiled import Compiled
 
 ROUND = ("sphere", "capsule")
 ON_PLANE = (*ROUND, "box")
+"""The shapes that touch a plane at balls or corners, with a `PlaneContact` for each."""
+SHAPES = {
+    "plane": shapes_of_jaxcon.Plane,
+    "sphere": shapes_of_jaxcon.Sphere,
+    "capsule": shapes_of_jaxcon.Capsule,
+    "ellipsoid": shapes_of_jaxcon.Ellipsoid,
+    "cylinder": shapes_of_jaxcon.Cylinder,
+    "box": shapes_of_jaxcon.Box,
+    "mesh": shapes_of_jaxcon.Hull,
+}
+"""The classes of jaxcon's shapes by the name of MuJoCo's geom."""
 FLAT = ("plane", "hfield")
 """The shapes that have no contacts with each other in MuJoCo."""
 
@@ -87,8 +100,11 @@ def shapes(compiled: Compiled, pair: GeomPair) -> tuple[str, str]:
 
 def supported(compiled: Compiled, pair: GeomPair) -> bool:
     """Returns True if jaxcon has a contact for the shapes of both geoms."""
-    first, second = shapes(compiled, pair)
-    return second in ON_PLANE if first == "plane" else {first, second} <= set(ROUND)
+    kinds = shapes(compiled, pair)
+    if not set(kinds) <= SHAPES.keys():
+        return False
+    first, second = (SHAPES[kind] for kind in kinds)
+    return set(kinds) <= set(ROUND) or ShapePair(first, second).supported
 
 
 def _listed(compiled: Compiled, margins: Margins) -> Iterator[GeomPair]:
