@@ -1,4 +1,4 @@
-"""The command line: `python -m jaxcon`, `python -m jaxcon verify` and `… tradeoff SCENE`."""
+"""The command line: `python -m jaxcon`, `… verify`, `… tradeoff SCENE` and `… model FILE`."""
 
 from __future__ import annotations
 
@@ -50,6 +50,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     compare.add_argument("--picture", help="where to write the work-precision diagram")
     compare.add_argument("--json", type=Path, metavar="FILE", help="also write the figures there")
     compare.add_argument("--all", action="store_true", help="print every run")
+    robot = commands.add_parser("model", help="what is read from a model of MuJoCo")
+    robot.add_argument("model", metavar="FILE", help="a model (.xml, .urdf)")
+    robot.add_argument("--ignore", nargs="*", default=(), help="features to leave out")
+    robot.add_argument("--batch", type=whole, default=256, help="worlds of the measured rollout")
+    robot.add_argument("--quick", action="store_true", help="read only; compile and run nothing")
+    robot.add_argument("--picture", help="where to draw the model at its start")
     options = parser.parse_args(arguments)
     for path in (vars(options).get(name) for name in ("picture", "json", "file")):
         if path and not Path(path).absolute().parent.is_dir():
@@ -60,6 +66,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return run_verify(options.cases, options.json)
     if options.command == "tradeoff":
         return run_tradeoff(options)
+    if options.command == "model":
+        return run_model(options)
     return run_demo(options.copies, options.seconds, options.picture)
 
 
@@ -134,6 +142,76 @@ def run_tradeoff(options: argparse.Namespace) -> int:
                 print(error)
                 return 1
     return 0
+
+
+def run_model(options: argparse.Namespace) -> int:
+    """Prints what is read from a model, compiles and times its rollouts, and draws it.
+
+    Returns:
+        The exit status: 0 if the model was read, 1 if it is refused, 2 if it cannot be compiled.
+    """
+    from jaxcon.core.cores import use_all_cores
+    from jaxcon.io.overview import overview
+
+    with contextlib.suppress(RuntimeError):  # a program that has used JAX keeps its devices
+        use_all_cores()
+    try:
+        found = overview(options.model, tuple(options.ignore))
+    except (ValueError, OSError) as error:
+        print(error)
+        return 2
+    print(found)
+    if found.model is None:
+        return 1
+    if options.picture:
+        os.environ.setdefault("MPLBACKEND", "Agg")
+        from jaxcon import view
+
+        figure: Any = view.draw(found.model.system, found.model.start.q).figure
+        figure.savefig(options.picture)
+    if not options.quick:
+        compiling, rate = rollout_rate(found.model, options.batch)
+        print(f"  a rollout of {options.batch} worlds compiles in {compiling:.1f} s and runs at")
+        print(f"  {rate:,.0f} steps/s from the start with zero control, by model.method()")
+    return 0
+
+
+def rollout_rate(model: Any, batch: int, steps: int = 100) -> tuple[float, float]:
+    """Compiles and times rollouts of a model by its default method.
+
+    Args:
+        model: a `jc.io.MujocoModel`.
+        batch: the number of worlds.
+        steps: the number of steps of a rollout.
+
+    Returns:
+        The seconds of tracing and compiling, and steps of all worlds in a second, as the median of
+        five runs.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    import jaxcon as jc
+
+    system, method = model.system, model.method()
+    start = jc.init(system, method, model.start.q, model.start.v)
+    control = jnp.zeros((steps, system.layout.n_u), start.q.dtype)
+    worlds = jax.tree.map(lambda x: jnp.broadcast_to(x, (batch, *x.shape)), start)
+    if batch % jax.device_count() == 0:
+        worlds = jc.shard(worlds)
+
+    def end(state: Any) -> Any:
+        given = control if system.layout.n_u else None
+        return jc.rollout(system, method, state, given, model.timestep, steps)[0]
+
+    begin = time.perf_counter()
+    run = jax.jit(jax.vmap(end)).lower(worlds).compile()
+    compiling, seconds = time.perf_counter() - begin, []
+    for _ in range(6):
+        begin = time.perf_counter()
+        jax.block_until_ready(run(worlds))
+        seconds.append(time.perf_counter() - begin)
+    return compiling, batch * steps / sorted(seconds[1:])[2]
 
 
 def find_scene(name: str) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 
 import numpy as np
 
@@ -75,14 +75,20 @@ def refuse(compiled: Compiled) -> None:
     Raises:
         NotImplementedError: the model has such a feature.
     """
+    for reason in reasons(compiled):
+        raise NotImplementedError(f"from_mjcf: {reason}")
+
+
+def reasons(compiled: Compiled) -> Iterator[str]:
+    """Yields why `refuse` refuses a model, as messages; nothing if it does not."""
     for key, (what, search) in REFUSED.items():
         if key not in compiled.ignored and (names := search(compiled)):
-            raise NotImplementedError(
-                f"from_mjcf: {what} {_listed(names)} are not supported; to simulate the model"
-                f" without them, say so by ignore=('{key}',)."
+            yield (
+                f"{what} {_listed(names)} are not supported; to simulate the model without them,"
+                f" say so by ignore=('{key}',)."
             )
     for what in _unsupported(compiled):
-        raise NotImplementedError(f"from_mjcf: {what} is not supported.")
+        yield f"{what} is not supported."
 
 
 def _unsupported(compiled: Compiled) -> Iterable[str]:
