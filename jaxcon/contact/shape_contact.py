@@ -23,7 +23,7 @@ from jaxcon.contact.shapes import (
 from jaxcon.core import checks
 from jaxcon.core.lanes import Vector
 from jaxcon.core.typing import DType, Lane
-from jaxcon.geometry import boxes, cylinders, solids
+from jaxcon.geometry import boxes, solids
 from jaxcon.geometry.pose import Pose
 from jaxcon.geometry.solids import Gap, Solid
 from jaxcon.system.elements import BetweenBodies, label
@@ -46,8 +46,6 @@ GAPS: Mapping[tuple[type[Shape], type[Shape]], Callable[[Solid, Solid], list[Gap
             (Box, Capsule): solids.box_capsule,
             (Cylinder, Capsule): solids.cylinder_capsule,
             (Box, Box): boxes.box_box,
-            (Box, Cylinder): cylinders.box_cylinder,
-            (Cylinder, Cylinder): cylinders.cylinder_cylinder,
         }
     )
 )
@@ -146,16 +144,15 @@ class ShapeContact(BetweenBodies):
         Plane             1       2        5         4    1          all
         Sphere     1                       1         1    1
         Capsule    2                       3         2
-        Cylinder   5      1       3        4         4
-        Box        4      1       2        4         4
+        Cylinder   5      1       3
+        Box        4      1       2                  4
         Ellipsoid  1      1
         Hull       all
         =========  =====  ======  =======  ========  ===  =========  ====
 
     λ has the shape (k, 1 + tangents), or (1 + tangents,) for one point. A point that does not exist
-    in a pose, such as three of the four points of two crossing edges, has a large gap. The normal
-    between two rims, or a rim and an edge, is found by a search; its derivative is left out. For
-    spheres and capsules with each other, use `CapsuleContact`. For a ball on a height field, use
+    in a pose, such as three of the four points of two crossing edges, has a large gap. For spheres
+    and capsules with each other, use `CapsuleContact`. For a ball on a height field, use
     `HeightFieldContact`.
 
     Attributes:

@@ -311,11 +311,11 @@ def from_mjcf(
     Ranges of hinges and slides become `jc.contacts.Limit`. Ranges of ball joints limit a
     `jc.joints.RotationAngle`. The attribute frictionloss becomes `jc.contacts.JointFriction`.
 
-    Pairs of geoms become contacts: shapes on planes, boxes and cylinders with each other, and
-    spheres and capsules with each other, with boxes and with cylinders; see
-    `jc.contacts.ShapeContact`. A capsule touches a plane at its ends, and a box at its corners. A
-    mesh touches a plane at up to 16 vertices of its convex hull; a warning names meshes that have
-    more. Contacts of other pairs are refused, or left out by `ignore=("shape",)`.
+    Pairs of geoms become contacts: shapes on planes, boxes with each other, and spheres and
+    capsules with each other, with boxes and with cylinders; see `jc.contacts.ShapeContact`. A
+    capsule touches a plane at its ends, and a box at its corners. A mesh touches a plane at up to
+    16 vertices of its convex hull; a warning names meshes that have more. Contacts of other pairs
+    are refused, or left out by `ignore=("shape",)`.
 
     Limits and contacts are hard and inelastic; `solref` and `solimp` are not used. They act at the
     distance `margin`, where MuJoCo's soft limits and contacts begin to act. Friction is Coulomb
