@@ -16,6 +16,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks import mjcf_agreement as agreement  # noqa: E402
 
+HAS_ACTIVATIONS = pytest.mark.filterwarnings("ignore:from_mjcf. .* activation:UserWarning")
 AGREE = 1e-8
 """Tolerance of accelerations, relative to the largest one of a state."""
 BODY = '<inertial pos="0.1 0.02 -0.2" mass="1.3" fullinertia="0.06 0.05 0.04 0.01 0.005 -0.004"/>'
@@ -490,6 +491,7 @@ ACTIVATED = """<actuator>
 </actuator>"""
 
 
+@HAS_ACTIVATIONS
 def test_activations_and_muscles_are_those_of_mujoco():
     """Accelerations at given activations, and activations after a step of MuJoCo's Euler."""
     m = model(STRUNG, TENDONS.format("", "", "") + ACTIVATED)
@@ -522,6 +524,7 @@ def test_activations_and_muscles_are_those_of_mujoco():
     assert plain.activate(plain.activation, jnp.zeros(0))[0].shape == (0,)
 
 
+@HAS_ACTIVATIONS
 def test_activations_have_gradients_and_keyframes():
     key = '<keyframe><key name="k" act="0.2 0.3 0.05 0.4 0.5" ctrl="1 1 1 1 1 1 1"/></keyframe>'
     text = TENDONS.format("", "", "") + ACTIVATED + key
@@ -540,3 +543,105 @@ def test_activations_have_gradients_and_keyframes():
     np.testing.assert_array_equal(np.diag(np.asarray(slope)[:, acting]) != 0, [1, 1, 0, 1, 1])
     with pytest.raises(ValueError, match="activation must have shape \\(5,\\), got \\(4,\\)"):
         read.activate(jnp.zeros(4, jnp.float32), start.control)
+
+
+def test_actuators_with_activations_are_named():
+    """`system, state = model` runs without the dynamics of the activations."""
+    m = model(STRUNG, TENDONS.format("", "", "") + ACTIVATED)
+    with pytest.warns(UserWarning, match="slow, exact, sum, biceps, soft have .* model.activate"):
+        read = jc.from_mjcf(m)
+    row = "slow (filter), exact (filterexact), sum (integrator), biceps (muscle), soft (muscle)"
+    assert f"{row}: call activate in each step" in repr(read)
+    filtered = '<general name="lag" joint="ja" dyntype="filter" dynprm="0.3"/>'
+    with pytest.warns(UserWarning, match="from_mjcf: lag has an activation") as caught:
+        jc.from_mjcf(model(STRUNG, f"<actuator>{filtered}</actuator>"))
+    assert [x.filename for x in caught] == [__file__]
+    assert "activations" not in repr(jc.from_mjcf(model(STRUNG)))
+
+
+CLAMPED = (
+    '<site name="post" pos="0.3 0.4 1.2"/>'
+    f'<body name="a"><joint name="ja" axis="0 1 0" {{0}}/>{BODY}<site name="a1" pos="0.2 0.1 0"/>'
+    f'<body name="b" pos="0 0.1 -0.5"><joint name="jb" axis="1 0 0.2" {{1}}/>{SMALL}'
+    '<site name="b1" pos="0.1 0 -0.2"/>'
+    f'<body name="c" pos="0 0 -0.4"><joint name="jc" axis="0 1 0.3"/>{SMALL}'
+    '<site name="c1" pos="0.1 0.1 0.1"/></body></body></body>'
+)
+CLAMPED_TENDONS = """<tendon>
+<fixed name="sum"><joint joint="ja" coef="0.7"/><joint joint="jc" coef="2"/></fixed>
+<spatial name="rope"><site site="post"/><site site="a1"/></spatial>
+<spatial name="above"><site site="b1"/><site site="c1"/></spatial></tendon>"""
+SMALL_RANGE = 'actuatorfrcrange="-1 1"'
+
+
+def clamped(actuators, first=SMALL_RANGE, second=""):
+    rest = f"{CLAMPED_TENDONS}<actuator>{actuators}</actuator>"
+    return model(CLAMPED.format(first, second), rest)
+
+
+@pytest.mark.parametrize(
+    ("actuators", "why"),
+    [
+        ('<motor name="m" tendon="sum" gear="9"/>', "the actuator 'm', which .* by a tendon"),
+        ('<motor name="m" tendon="rope"/>', "the actuator 'm', which acts on it by a tendon"),
+        ('<motor name="m" site="c1" gear="9"/>', "the actuator 'm', which acts on it by a site"),
+        (
+            '<motor name="m" site="c1" refsite="post"/>',
+            "the actuator 'm', which acts on it by a site",
+        ),
+        ('<motor joint="ja"/><motor tendon="sum" gear="9"/>', "2 actuators"),
+        ('<motor joint="ja"/><motor site="a1" gear="0 0 0 1 0 0"/>', "2 actuators"),
+        ('<motor joint="ja"/><motor jointinparent="ja"/>', "2 actuators"),
+    ],
+)
+def test_a_range_of_a_joint_beside_tendons_and_sites_is_refused(actuators, why):
+    """MuJoCo clamps the sum of all actuator forces on the joint."""
+    match = f"joint 'ja' has an actuatorfrcrange and {why}"
+    with pytest.raises(NotImplementedError, match=match):
+        jc.from_mjcf(clamped(actuators))
+
+
+def test_ranges_of_joints_on_which_others_do_not_act():
+    """The tendon and the site act between b and c, below both joints with a range."""
+    m = clamped(
+        '<motor joint="ja" gear="9" ctrlrange="-1 1"/><motor tendon="above" ctrlrange="-1 1"/>'
+        '<motor site="c1" refsite="b1" gear="3 1 2 0 0 0" ctrlrange="-1 1"/>'
+        '<motor site="c1" gear="0 0 0 0 0 0"/><motor tendon="rope" gear="0"/>',
+        second=SMALL_RANGE,
+    )
+    assert agreement.acceleration_error(m, 20) < AGREE
+
+
+@pytest.mark.parametrize(
+    "at", ['joint="free" gear="0 0 3 0 0 0"', 'joint="free" gear="0 0 0 1 2 0"', 'site="base"']
+)
+def test_muscles_without_a_length_are_refused(at):
+    body = f'<body><freejoint name="free"/>{BODY}<site name="base" pos="0.1 0 0"/></body>'
+    law = (
+        'gaintype="muscle" biastype="muscle" gainprm="0.7 1.2 60 200 0.5 1.6 1.5 1.3 1.2"'
+        ' biasprm="0.7 1.2 60 200 0.5 1.6 1.5 1.3 1.2" lengthrange="-1 1"'
+    )
+    m = model(body, f'<actuator><general name="pull" {at} {law}/></actuator>')
+    with pytest.raises(NotImplementedError, match="actuator 'pull' is a muscle on a free joint or"):
+        jc.from_mjcf(m)
+
+
+@pytest.mark.parametrize(
+    ("passive", "flag"),
+    [
+        ('stiffness="1"', "spring"),
+        ('damping="1"', "damper"),
+        ('frictionloss="1"', "frictionloss"),
+        ('range="0 1"', "limit"),
+    ],
+)
+def test_tendons_without_effect_are_not_refused(passive, flag):
+    """A tendon within one body cannot be imported, but a flag disables its only effect."""
+    text = (
+        '<mujoco><compiler autolimits="true"/><option><flag {}="disable"/></option>'
+        f'<worldbody>{STRUNG}</worldbody><tendon><spatial name="inert" {passive}>'
+        '<site site="b1"/><site site="b2"/></spatial></tendon></mujoco>'
+    )
+    jc.from_mjcf(text.format(flag))
+    with pytest.raises(NotImplementedError, match="tendon 'inert' lies in one body"):
+        jc.from_mjcf(text.format("contact"))

@@ -12,10 +12,13 @@ as in MuJoCo. The actuators of the scene get activations in place of controls.
 
 from __future__ import annotations
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 
 from jaxcon.core.pytree import pytree, static
+from jaxcon.core.summary import listed
 from jaxcon.core.typing import Array, DType
 from jaxcon.io.compiled import Compiled
 
@@ -36,6 +39,7 @@ class Activations:
         range: the range of each activation, (n, 2).
         kinds: the type of each activation, one of `DYNAMIC`.
         actuators: the index of the actuator of each activation.
+        names: MuJoCo's name of each of these actuators.
         early: True for actuators whose force uses the activation at the end of the step.
     """
 
@@ -44,6 +48,7 @@ class Activations:
     range: Array
     kinds: tuple[str, ...] = static()
     actuators: tuple[int, ...] = static()
+    names: tuple[str, ...] = static()
     early: tuple[bool, ...] = static()
 
     def advance(self, activation: Array, control: Array, dt: Array) -> tuple[Array, Array]:
@@ -84,6 +89,17 @@ class Activations:
         return gap / jnp.maximum(slow + (fast - slow) * share, SHORTEST)
 
 
+def warn(names: tuple[str, ...]) -> None:
+    """Warns that the actuators with these names have activations; gives none without names."""
+    if names:
+        warnings.warn(
+            f"from_mjcf: {listed(names)} {'have' if len(names) > 1 else 'has'} an activation, which"
+            " a step does not advance. Call model.activate in each step, and pass jc.step the"
+            " control that it returns; see MujocoModel.activate.",
+            stacklevel=3,
+        )
+
+
 def activations(compiled: Compiled, dtype: DType) -> Activations:
     """Returns the dynamics of the activations of a model."""
     m = compiled.model
@@ -102,5 +118,6 @@ def activations(compiled: Compiled, dtype: DType) -> Activations:
         jnp.asarray(np.reshape(within, (-1, 2)), dtype),
         tuple(kinds[i] for i in found),
         tuple(found),
+        tuple(compiled.name("actuator", i) for i in found),
         tuple(bool(m.actuator_actearly[i]) for i in found),
     )

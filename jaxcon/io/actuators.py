@@ -14,6 +14,7 @@ from jaxcon.io.activations import DYNAMIC, SHORTEST
 from jaxcon.io.compiled import Compiled, Names
 from jaxcon.io.joints import Coordinate, Ends, pushing, turning
 from jaxcon.io.links import Link, LinkJoint, scene_body
+from jaxcon.io.tendons import joints_between, moved_joints
 from jaxcon.system.actuators import AffineActuator, Motor, Muscle
 from jaxcon.system.layout import WORLD
 
@@ -46,6 +47,8 @@ LAWS = (
 Each entry has MuJoCo's field, its enumeration, and the names of the supported values.
 """
 
+ON_JOINTS = ("joint", "jointinparent")
+"""The types of transmission of actuators on joints."""
 ALIGNED = 1e-9
 """The largest angle [rad] between a site and its reference site that count as aligned."""
 
@@ -86,8 +89,11 @@ def actuators(
         NotImplementedError: an actuator is not supported.
     """
     m, found = compiled.model, Actuators([], [])
-    for i in range(len(m.actuator_trntype)):
+    indices = range(len(m.actuator_trntype))
+    for i in indices:
         _check(compiled, i)
+    _check_joint_ranges(compiled, links)
+    for i in indices:
         name = names.take(compiled.name("actuator", i), "actuator")
         kind, element = compiled.choice("mjtTrn", m.actuator_trntype[i]), None
         if kind == "site":
@@ -155,6 +161,50 @@ def _check(compiled: Compiled, i: int) -> None:
         )
 
 
+def _check_joint_ranges(compiled: Compiled, links: tuple[Link, ...]) -> None:
+    """Checks that each joint with an actuatorfrcrange has one actuator, which acts on it directly.
+
+    MuJoCo clamps the sum of all actuator forces on such a joint.
+
+    Raises:
+        NotImplementedError: several actuators act on the joint, or one by a tendon or at a site.
+    """
+    m = compiled.model
+    limited = {int(j) for j in np.flatnonzero(m.jnt_actfrclimited)}
+    if not limited:
+        return
+    moved = [_moved_joints(compiled, links, i) for i in range(len(m.actuator_trntype))]
+    for joint in sorted(limited):
+        acting = [i for i, joints in enumerate(moved) if joint in joints]
+        owner = f"from_mjcf: joint '{compiled.name('joint', joint)}' has an actuatorfrcrange and"
+        if len(acting) > 1:
+            raise NotImplementedError(
+                f"{owner} {len(acting)} actuators, whose sum it limits; give each a forcerange"
+                " instead."
+            )
+        for i in acting:
+            kind = compiled.choice("mjtTrn", m.actuator_trntype[i])
+            if kind not in ON_JOINTS:
+                raise NotImplementedError(
+                    f"{owner} the actuator '{compiled.name('actuator', i)}', which acts on it by a"
+                    f" {kind}; it limits only actuators on the joint. Give the actuator a"
+                    " forcerange instead."
+                )
+
+
+def _moved_joints(compiled: Compiled, links: tuple[Link, ...], i: int) -> set[int]:
+    """Returns MuJoCo's ids of the joints on which actuator i has a moment."""
+    m, (first, second) = compiled.model, map(int, compiled.model.actuator_trnid[i])
+    kind, gear = compiled.choice("mjtTrn", m.actuator_trntype[i]), m.actuator_gear[i]
+    if kind == "site":
+        above = 0 if second < 0 else int(m.site_bodyid[second])
+        ends = int(m.site_bodyid[first]), above
+        return joints_between(compiled, ends) if gear.any() else set()
+    if kind == "tendon":
+        return moved_joints(compiled, links, first) if gear[0] else set()
+    return {first} if gear[0] else set()  # ball and free joints have no actuatorfrcrange
+
+
 def _law(
     compiled: Compiled, i: int, name: str, transmission: Transmission
 ) -> Motor | AffineActuator | Muscle:
@@ -172,7 +222,13 @@ def _law(
     control = m.actuator_ctrlrange[i] if clamped else None
     force = _force_range(compiled, i, gear)
     if compiled.choice("mjtGain", m.actuator_gaintype[i]) == "muscle":
-        length = gear * reference * measured
+        if not measured:
+            raise NotImplementedError(
+                f"from_mjcf: actuator '{compiled.name('actuator', i)}' is a muscle on a free joint"
+                " or at a site without a reference site. Its length is always zero in MuJoCo, which"
+                " is not supported; use a tendon."
+            )
+        length = gear * reference
         return _muscle(compiled, i, name, at, (gear, length), control, force)
     gain, bias = m.actuator_gainprm[i, :3].copy(), m.actuator_biasprm[i, :3].copy()
     gain[1:] *= compiled.choice("mjtGain", m.actuator_gaintype[i]) == "affine"
@@ -244,7 +300,7 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     limits of the actuator and of its joint or tendon.
 
     Raises:
-        NotImplementedError: the joint or tendon limits the sum of several actuators.
+        NotImplementedError: the tendon limits the sum of several actuators.
     """
     m, owner = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
@@ -254,11 +310,10 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     what, field = ("tendon", "tendon") if kinds[i] == "tendon" else ("joint", "jnt")
     if not getattr(m, f"{field}_actfrclimited")[owner]:
         return of_actuator
-    same = ("tendon",) if what == "tendon" else ("joint", "jointinparent")
-    beside = np.isin(kinds, same) & (m.actuator_trnid[:, 0] == owner)
-    if sum(beside) > 1:
+    beside = (np.array(kinds) == "tendon") & (m.actuator_trnid[:, 0] == owner)
+    if what == "tendon" and sum(beside) > 1:
         raise NotImplementedError(
-            f"from_mjcf: {what} '{compiled.name(what, owner)}' has an actuatorfrcrange and"
+            f"from_mjcf: tendon '{compiled.name('tendon', owner)}' has an actuatorfrcrange and"
             f" {sum(beside)} actuators, whose sum it limits; give each a forcerange instead."
         )
     limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / gear)

@@ -17,7 +17,7 @@ from jaxcon.core.summary import listed, span, table
 from jaxcon.core.typing import Array, DType, Scalar
 from jaxcon.execution.step import SolutionAt
 from jaxcon.io import maps
-from jaxcon.io.activations import Activations, activations
+from jaxcon.io.activations import Activations, activations, warn
 from jaxcon.io.actuators import Transmission, actuators
 from jaxcon.io.compiled import Compiled, Names, Source
 from jaxcon.io.contacts import contacts
@@ -86,10 +86,13 @@ class MujocoModel:
     keyframes: tuple[str, ...] = static()
 
     def __repr__(self) -> str:
-        """Describes the step size, the keyframes and the system."""
+        """Describes the step size, the keyframes, the activations and the system."""
+        pairs = zip(self.activations.names, self.activations.kinds, strict=True)
+        acts = listed([f"{name} ({kind})" for name, kind in pairs])
         rows = [
             ("timestep", span(self.timestep, "s")),
             ("keyframes", listed(self.keyframes)),
+            ("activations", acts and f"{acts}: call activate in each step"),
         ]
         return f"{table('MujocoModel', rows)}\n{self.system!r}"
 
@@ -336,11 +339,12 @@ def from_mjcf(
             "contact": all contacts,
             "self_contact": contacts between two moving bodies,
             "shape": contacts between unsupported shapes,
-            "mocap": motions of mocap bodies, which are held at their pose in the model,
+            "mocap": motions of mocap bodies, which are held at their pose in the model; mpos and
+                mquat of keyframes are not used,
             "torsion": torsional and rolling friction (condim 4 or 6),
-            "limit": all joint limits,
+            "limit": all limits of joints and tendons,
             "ball_limit": limits of ball joints,
-            "friction": dry friction of joints,
+            "friction": dry friction of joints and tendons,
             "tendon": springs, dampers, rotors, friction and ranges of tendons,
             "fluid": density and viscosity,
             "gravcomp": gravity compensation.
@@ -348,7 +352,9 @@ def from_mjcf(
         dtype: the floating dtype of the model; by default JAX's default float.
 
     Returns:
-        The model. `system, state = jc.from_mjcf(path)` is enough to simulate it.
+        The model. `system, state = jc.from_mjcf(path)` is enough to simulate it if no actuator has
+        an activation. Filters, integrators and muscles have one: call `activate` of the model in
+        each step. A warning names these actuators, and the `repr` of the model lists them.
 
     Raises:
         ImportError: MuJoCo is not installed.
@@ -380,6 +386,8 @@ def from_mjcf(
         {x: getattr(m, f"key_{x}")[i] for x in ("time", "qpos", "qvel", "ctrl", "act")}
         for i in range(m.nkey)
     ]
+    dynamics = activations(compiled, scene.dtype)
+    warn(dynamics.names)
     timestep = checks.check("from_mjcf", "timestep of the option", m.opt.timestep, (), above=0)
     return MujocoModel(
         system,
@@ -388,7 +396,7 @@ def from_mjcf(
         _tree(compiled, links, coordinates, cast),
         jax.tree.map(cast, tuple(keys)),
         sensors,
-        activations(compiled, scene.dtype),
+        dynamics,
         tuple((compiled.name("joint", i), at) for i, at in sorted(coordinates.items())),
         tuple(compiled.name("key", i) for i in range(m.nkey)),
     )

@@ -6,7 +6,7 @@ links, divided by the divisor of the last pulley.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
@@ -23,6 +23,16 @@ from jaxcon.system.actuators import DeadBandSpring, JointDamper, JointSpring
 
 Element: TypeAlias = JointSpring | DeadBandSpring | JointDamper | Armature | JointFriction | Limit
 """A passive element on a tendon."""
+
+
+PASSIVE = {
+    "stiffness": ("spring", "passive"),
+    "damping": ("damper", "passive"),
+    "armature": (),
+    "frictionloss": ("friction", "frictionloss", "constraint"),
+    "limited": ("limit", "constraint"),
+}
+"""The fields of MuJoCo's tendons for passive elements, with the features that disable each."""
 
 
 class Tendons(NamedTuple):
@@ -77,13 +87,9 @@ def tendons(
 
 def _acting(compiled: Compiled) -> set[int]:
     """Returns MuJoCo's ids of the tendons that affect the motion."""
-    m = compiled.model
-    result = set() if compiled.disabled("tendon") else set(map(int, np.flatnonzero(_passive(m))))
-    if compiled.disabled("limit", "constraint"):
-        limited = set()
-    else:
-        limited = set(map(int, np.flatnonzero(m.tendon_limited)))
-    result |= set() if compiled.disabled("tendon") else limited
+    m, result = compiled.model, set()
+    for numbers in _passive(compiled).values():
+        result |= set(map(int, np.flatnonzero(numbers)))
     for i in range(m.neq):
         if m.eq_active0[i] and compiled.choice("mjtEq", m.eq_type[i]) == "tendon":
             off = compiled.disabled("equality", "constraint")
@@ -95,11 +101,17 @@ def _acting(compiled: Compiled) -> set[int]:
     return result
 
 
-def _passive(m) -> np.ndarray:
-    """Returns a mask of the tendons with springs, damping, rotors or dry friction, (ntendon,)."""
-    fields = ("stiffness", "damping", "armature", "frictionloss")
-    arrays = [np.asarray(getattr(m, f"tendon_{f}", np.zeros(m.ntendon))) != 0 for f in fields]
-    return np.any(arrays, axis=0)
+def _passive(compiled: Compiled) -> dict[str, np.ndarray]:
+    """Returns MuJoCo's numbers of the passive elements, (ntendon,), by the fields in `PASSIVE`.
+
+    Numbers that a flag or `ignore` disables are zero.
+    """
+    m = compiled.model
+    return {
+        field: np.asarray(getattr(m, f"tendon_{field}", np.zeros(m.ntendon)))
+        * (not compiled.disabled("tendon", *switches))
+        for field, switches in PASSIVE.items()
+    }
 
 
 def _read(compiled: Compiled) -> set[int]:
@@ -176,6 +188,32 @@ def _segments(compiled: Compiled, links: tuple[Link, ...], t: int) -> list[Segme
     return found
 
 
+def moved_joints(compiled: Compiled, links: tuple[Link, ...], t: int) -> set[int]:
+    """Returns MuJoCo's ids of the joints that change the length of a tendon."""
+    m = compiled.model
+    if not _spatial(compiled, t):
+        return {j for _, j, coefficient in _wraps(compiled, t) if coefficient}
+    found = set()
+    for x in _segments(compiled, links, t):
+        bodies = [int(m.site_bodyid[x.first]), int(m.site_bodyid[x.second])]
+        bodies += [int(m.geom_bodyid[x.geom])] if x.geom >= 0 else []
+        found |= joints_between(compiled, bodies)
+    return found
+
+
+def joints_between(compiled: Compiled, bodies: Iterable[int]) -> set[int]:
+    """Returns MuJoCo's ids of the joints that move some of the bodies, but not all of them."""
+    m, above = compiled.model, []
+    for body in bodies:
+        joints = set()
+        while body:
+            start = int(m.body_jntadr[body])
+            joints |= set(range(start, start + int(m.body_jntnum[body])))
+            body = int(m.body_parentid[body])
+        above.append(joints)
+    return set.union(*above) - set.intersection(*above)
+
+
 Term: TypeAlias = tuple[Span | WrappedSpan | None, Coordinate, float]
 """A term of a tendon: its span, if it is new; the coordinate; and the coefficient."""
 
@@ -216,15 +254,10 @@ def passive_tendons(
     compiled: Compiled, coordinates: dict[int, Coordinate], names: Names
 ) -> Iterator[Element]:
     """Yields springs, dampers, rotors, dry friction and limits of tendons."""
-    m = compiled.model
-    if compiled.disabled("tendon"):
-        return
-    rubs = not compiled.disabled("friction", "frictionloss", "constraint")
-    ends = not compiled.disabled("limit", "constraint")
+    m, numbers = compiled.model, _passive(compiled)
     for t, at in coordinates.items():
         label, length = compiled.name("tendon", t), m.tendon_length0[t]
-        stiffness = 0.0 if compiled.disabled("spring", "passive") else m.tendon_stiffness[t]
-        damping = 0.0 if compiled.disabled("damper", "passive") else m.tendon_damping[t]
+        stiffness, damping, armature, friction, limited = (numbers[x][t] for x in PASSIVE)
         lower, upper = m.tendon_lengthspring[t] - length
         if stiffness:
             name = names.take(f"{label} spring", "spring")
@@ -234,12 +267,12 @@ def passive_tendons(
                 yield JointSpring(name, at.joint, stiffness, damping, lower)
         elif damping:
             yield JointDamper(names.take(f"{label} damper", "damper"), at.joint, damping)
-        if armature := getattr(m, "tendon_armature", np.zeros(m.ntendon))[t]:
+        if armature:
             yield Armature(names.take(f"{label} rotor", "rotor"), at.joint, armature)
-        if rubs and m.tendon_frictionloss[t]:
+        if friction:
             name = names.take(f"{label} friction", "friction")
-            yield JointFriction(name, at.joint, m.tendon_frictionloss[t])
-        if ends and m.tendon_limited[t]:
+            yield JointFriction(name, at.joint, friction)
+        if limited:
             inward = m.tendon_margin[t] * np.array([1.0, -1.0])
             lower, upper = m.tendon_range[t] - length + inward
             yield Limit(names.take(f"{label} limit", "limit"), at.joint, lower, upper)
