@@ -13,17 +13,20 @@ from __future__ import annotations
 
 import argparse
 import collections
+import importlib
 import sys
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from jaxcon.io.overview import overview
 
 
 @dataclass
 class Counts:
-    """The models of a folder.
+    """The results of a collection.
 
     Attributes:
         tried: number of models that MuJoCo compiles.
@@ -38,12 +41,12 @@ class Counts:
 
 def models(folder: Path) -> list[Path]:
     """Returns the files below a folder that MuJoCo compiles and in which something moves."""
-    import mujoco
+    library: Any = importlib.import_module("mujoco")
 
     found = []
     for path in sorted(folder.rglob("*.xml")):
         try:
-            compiled = mujoco.MjModel.from_xml_path(str(path))
+            compiled = library.MjModel.from_xml_path(str(path))
         except ValueError:  # a part of a model, or one whose files are elsewhere
             continue
         if compiled.nv:
@@ -57,10 +60,10 @@ def kind(reason: str) -> str:
     return " ".join(words[:6])
 
 
-def count(folder: Path, verbose: bool = False) -> Counts:
-    """Reads all models below a folder."""
+def count(paths: Sequence[Path], verbose: bool = False) -> Counts:
+    """Reads models, and counts which of them are read whole."""
     result = Counts()
-    for path in models(folder):
+    for path in paths:
         result.tried += 1
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -87,7 +90,7 @@ def main(given: list[str] | None = None) -> int:
     reasons: collections.Counter[str] = collections.Counter()
     print("| folder | models | read whole | refused |\n|---|---|---|---|")
     for folder in options.folders:
-        counts = count(folder, options.verbose)
+        counts = count(models(folder), options.verbose)
         refused = counts.tried - counts.whole
         print(f"| {folder.name} | {counts.tried} | {counts.whole} | {refused} |", flush=True)
         reasons += counts.reasons

@@ -181,6 +181,17 @@ def mjcf_agreement(quick: bool) -> list[Metric]:
     return metrics
 
 
+@entry("collections", MUJOCO, GYMNASIUM)
+def collections(quick: bool) -> list[Metric]:
+    """Counts the models of Gymnasium that are refused."""
+    from benchmarks import collections as study
+    from benchmarks import legged
+
+    paths = study.models(legged.ASSETS)
+    counts = study.count(paths[:2] if quick else paths)
+    return [Metric("tried", counts.tried), count("refused", counts.tried - counts.whole)]
+
+
 @entry("bounded")
 def bounded(quick: bool) -> list[Metric]:
     """Measures the largest residual of contact solvers over random states, and cost of a step."""
