@@ -261,7 +261,8 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
             f"from_mjcf: {what} '{compiled.name(what, owner)}' has an actuatorfrcrange and"
             f" {sum(beside)} actuators, whose sum it limits; give each a forcerange instead."
         )
-    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / gear)
+    # MuJoCo limits a joint's force after the gear, and a tendon's force before it
+    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / (gear if what == "joint" else 1))
     return limits if of_actuator is None else np.clip(of_actuator, *limits)
 
 
