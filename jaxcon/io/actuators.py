@@ -249,7 +249,7 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     m, owner = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
     kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
-    if kinds[i] == "site" or not gear:
+    if kinds[i] == "site" or (not gear and kinds[i] != "tendon"):
         return of_actuator
     what, field = ("tendon", "tendon") if kinds[i] == "tendon" else ("joint", "jnt")
     if not getattr(m, f"{field}_actfrclimited")[owner]:
