@@ -275,3 +275,177 @@ def test_a_wrapped_span_keeps_its_place_on_a_body_whose_center_moves():
     changed = system.with_params({"c": {"center": jnp.array([0.1, 0.2, 0.3])}})
     moved = jc.systems.restate(state, system, changed)
     np.testing.assert_allclose(jc.coordinate(changed, moved, "x"), 0, atol=1e-12)
+
+
+MASS = '<inertial pos="{} 0.02 -0.2" mass="{}" diaginertia="0.02 0.03 0.025"/>'
+
+
+def sensed(bodies, rest="", flags="", ignore=()):
+    """A MuJoCo model, its data and the same model read by jaxcon."""
+    mujoco = pytest.importorskip("mujoco")
+    m = mujoco.MjModel.from_xml_string(
+        f'<mujoco><compiler angle="radian"/><option>{flags}</option>'
+        f"<worldbody>{bodies}</worldbody>{rest}</mujoco>"
+    )
+    return mujoco, m, mujoco.MjData(m), jc.from_mjcf(m, ignore)
+
+
+def compare(model, qpos, qvel=None, ctrl=(), names=None, read=None):
+    """Compares sensors with those of MuJoCo, of the same names and at the same state."""
+    mujoco, m, data, imported = model
+    read = read or imported
+    data.qpos[:], data.ctrl[:] = qpos, ctrl
+    data.qvel[:] = 0 if qvel is None else qvel
+    mujoco.mj_forward(m, data)
+    names = names or tuple(read.sensor_slices)
+    state, control = read.state(data.qpos, data.qvel), jnp.asarray(data.ctrl)
+    info = jc.forward_dynamics(read.system, state, control, read.method(), 1e-3)
+    expected = np.concatenate([data.sensordata[read.sensor_slices[name]] for name in names])
+    np.testing.assert_allclose(read.sensors(state, info, names=names), expected, atol=1e-9)
+    return expected
+
+
+SUBTREES = "".join(
+    f'<{kind} name="{kind} {body}" body="{body}"/>'
+    for kind in ("subtreecom", "subtreelinvel", "subtreeangmom")
+    for body in ("world", "base", "pad", "mark", "arm", "dot")
+)
+
+
+@pytest.mark.parametrize("mocap", ["", ' mocap="true"'])
+def test_sensors_of_subtrees_and_energy_have_the_bodies_that_do_not_move(mocap):
+    """A base, a pad on it, and bodies without mass, at which a subtree is the body alone."""
+    bodies = (
+        f'<body name="base" pos="0.3 0.2 0.5" euler="0.3 0.2 0.1"{mocap}>{MASS.format(0.1, 1.3)}'
+        f'<body name="pad" pos="0 0.4 0">{MASS.format(0.2, 0.7)}</body>'
+        '<body name="mark" pos="0.1 0.5 0.2"/></body>'
+        f'<body name="arm" pos="0 0 1"><joint axis="0 1 0.2"/>{MASS.format(0.3, 1.1)}'
+        f'<body name="dot" pos="0.2 0.3 0"/></body>'
+    )
+    if not mocap:  # the arm stands on the base, so that the base's subtree moves
+        bodies = bodies.replace('</body><body name="arm"', '<body name="arm"') + "</body>"
+    rest = f"<sensor>{SUBTREES}<e_potential/></sensor>"
+    model = sensed(bodies, rest, ignore=("mocap",) if mocap else ())
+    expected = compare(model, [0.4], [0.7])
+    assert np.all(np.isfinite(expected))
+    read = model[3]
+
+    def potential(angle):
+        return jnp.sum(read.sensors(read.state(angle[None]), names=tuple(read.sensor_slices)))
+
+    assert np.isfinite(jax.grad(potential)(jnp.asarray(0.4)))
+
+
+def test_the_force_of_an_actuator_is_that_before_the_limit_of_its_joint():
+    bodies = f'<body><joint name="j" actuatorfrcrange="-1 1"/>{MASS.format(0.3, 1.1)}</body>'
+    sensors = '<actuatorfrc name="own" actuator="m"/><jointactuatorfrc name="joint" joint="j"/>'
+    rest = f'<actuator><motor name="m" joint="j" gear="9"/></actuator><sensor>{sensors}</sensor>'
+    model = sensed(bodies, rest)
+    assert compare(model, [0.1], ctrl=[-1.243], names=("joint",)) == -1
+    read = model[3]
+    with pytest.raises(NotImplementedError, match="'own'.* a joint with an actuatorfrcrange"):
+        read.sensors(read.start, control=jnp.ones(1))
+
+
+def test_tendon_sensors_have_the_limit_of_the_forces_of_a_tendon():
+    bodies = f'<body><joint name="j"/>{MASS.format(0.3, 1.1)}</body>'
+    tendon = (
+        '<tendon><fixed name="t" actuatorfrcrange="-1 1"><joint joint="j" coef="2"/></fixed>'
+        "</tendon>"
+    )
+    motor = '<general name="m" tendon="t" gear="9" gainprm="3"/>'
+    sensors = '<actuatorfrc actuator="m"/><tendonactuatorfrc tendon="t"/>'
+    rest = f"{tendon}<actuator>{motor}</actuator><sensor>{sensors}</sensor>"
+    compare(sensed(bodies, rest), [0.1], ctrl=[-1.243])
+
+
+def test_limits_of_a_joint_and_a_tendon_of_one_name_are_told_apart():
+    bodies = f'<body><joint name="a" range="-3 -2"/>{MASS.format(0.3, 1.1)}</body>'
+    tendon = '<tendon><fixed name="a" range="-3 -0.4"><joint joint="a" coef="1"/></fixed></tendon>'
+    sensors = '<jointlimitpos joint="a"/><tendonlimitpos tendon="a"/>'
+    expected = compare(sensed(bodies, f"{tendon}<sensor>{sensors}</sensor>"), [0.3])
+    np.testing.assert_allclose(expected, [-2.3, -0.7])
+
+
+def test_contacts_with_similar_names_are_told_apart():
+    """A capsule "foot" has two contacts, of which the second is named as that of a ball."""
+    bodies = "".join(
+        f'<body name="{name}" pos="{x} 0 {height}"><joint type="slide" axis="0 0 1"/>'
+        f'<geom name="{name}" type="{kind}" size="{size}" mass="1" euler="0 1.5707963267948966 0"/>'
+        f'<site name="{name}" size="1"/></body>'
+        for name, kind, size, x, height in (
+            ("foot", "capsule", "0.1 0.2", 0, 0.1),
+            ("foot 2", "sphere", "0.1", 3, 0.1),
+            ("drum", "cylinder", "0.2 0.1", 6, 0.2),
+        )
+    )
+    bodies = '<geom name="floor" type="plane" size="9 9 1"/>' + bodies
+    names = ("foot", "foot 2", "drum")
+    rest = "".join(f'<touch name="{name}" site="{name}"/>' for name in names)
+    read = sensed(bodies, f"<sensor>{rest}</sensor>")[3]
+    info = jc.step(read.system, read.method(), read.start, None, 2e-3)[1]
+    np.testing.assert_allclose(read.sensors(read.start, info), [9.81] * 3, rtol=1e-6)
+
+
+def test_sensors_without_a_name_keep_apart_from_sensors_with_theirs():
+    bodies = "".join(
+        f'<body><joint name="{name}" axis="0 1 0"/>{MASS.format(0.3, 1.1)}</body>' for name in "ab"
+    )
+    tie = "".join(
+        f'<motor {name} joint="{joint}" gear="{gear}"/>'
+        for name, joint, gear in (("", "a", 2), ('name="actuator 0"', "b", 3))
+    )
+    sensors = (
+        '<jointpos joint="a"/><jointpos name="sensor 0" joint="b"/>'
+        '<actuatorvel name="slow" actuator="actuator 0"/>'
+    )
+    rest = f"<actuator>{tie}</actuator><sensor>{sensors}</sensor>"
+    model = sensed(bodies, rest)
+    assert tuple(model[3].sensor_slices) == ("sensor 0 (unnamed)", "sensor 0", "slow")
+    expected = compare(model, [0.1, 0.2], [0.3, 0.4], ctrl=[0, 0])
+    np.testing.assert_allclose(expected, [0.1, 0.2, 1.2])
+
+
+def test_sensors_of_actuators_follow_a_changed_gear():
+    """A motor with a gain, whose parameter is the product of both, and a servo."""
+    bodies = f'<body><joint name="a" axis="0 1 0"/>{MASS.format(0.3, 1.1)}</body>'
+    tendon = '<tendon><fixed name="t"><joint joint="a" coef="2"/></fixed></tendon>'
+    drives = (
+        '<general name="m" joint="a" gainprm="3" gear="2"/>'
+        '<position name="s" joint="a" kp="5" kv="0.3" gear="2"/>'
+        '<general name="n" tendon="t" gainprm="3" gear="2"/><motor name="z" joint="a" gear="0"/>'
+    )
+    sensors = "".join(
+        f'<actuator{kind} name="{kind} {drive}" actuator="{drive}"/>'
+        for drive in "msnz"
+        for kind in ("pos", "vel", "frc")
+    )
+    sensors += '<tendonactuatorfrc tendon="t"/><jointactuatorfrc joint="a"/>'
+    rest = f"{tendon}<actuator>{drives}</actuator><sensor>{sensors}</sensor>"
+    model = sensed(bodies, rest)
+    ctrl = [0.3, 0.4, 0.5, 0.6]
+    compare(model, [0.2], [0.3], ctrl)
+    changes = {"m": {"gear": 12.0}, "s": {"gear": 4.0}, "n": {"gear": 12.0}}
+    read = model[3].with_params(changes)
+    model[1].actuator_gear[:3, 0] = 4
+    compare(model, [0.2], [0.3], ctrl, read=read)
+
+
+def test_sensors_of_ignored_limits_and_contacts_are_refused():
+    bodies = (
+        '<geom type="plane" size="2 2 1"/><body><joint name="a" type="slide" range="1 2"/>'
+        '<geom size="0.1" mass="1"/><site name="s" size="1"/></body>'
+    )
+    sensors = '<jointlimitpos name="stop" joint="a"/><touch name="pressed" site="s"/>'
+    rest = f"<sensor>{sensors}</sensor>"
+    read = sensed(bodies, rest, ignore=("limit", "contact"))[3]
+    for name in ("stop", "pressed"):
+        with pytest.raises(NotImplementedError, match=f"'{name}'.*left out by `ignore`"):
+            read.sensors(read.start, names=(name,))
+    with pytest.raises(ValueError, match=r"must be a sequence of names.*names=\('stop',\)"):
+        read.sensors(read.start, names="stop")
+    both = '<clock name="time"/><jointlimitpos name="stop" joint="a"/>'
+    read = sensed(bodies, f"<sensor>{both}</sensor>", ignore=("limit",))[3]
+    with pytest.raises(NotImplementedError, match="model.readings.supported: 'time'\\."):
+        read.sensors(read.start)
+    assert read.sensors(read.start, names=read.readings.supported) == 0

@@ -305,7 +305,7 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
     m, owner = compiled.model, int(compiled.model.actuator_trnid[i, 0])
     of_actuator = m.actuator_forcerange[i] if m.actuator_forcelimited[i] else None
     kinds = [compiled.choice("mjtTrn", kind) for kind in m.actuator_trntype]
-    if kinds[i] == "site" or not gear:
+    if kinds[i] == "site" or (not gear and kinds[i] != "tendon"):
         return of_actuator
     what, field = ("tendon", "tendon") if kinds[i] == "tendon" else ("joint", "jnt")
     if not getattr(m, f"{field}_actfrclimited")[owner]:
@@ -316,7 +316,8 @@ def _force_range(compiled: Compiled, i: int, gear: float) -> np.ndarray | None:
             f"from_mjcf: tendon '{compiled.name('tendon', owner)}' has an actuatorfrcrange and"
             f" {sum(beside)} actuators, whose sum it limits; give each a forcerange instead."
         )
-    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / gear)
+    # MuJoCo limits a joint's force after the gear, and a tendon's force before it
+    limits = np.sort(getattr(m, f"{field}_actfrcrange")[owner] / (gear if what == "joint" else 1))
     return limits if of_actuator is None else np.clip(of_actuator, *limits)
 
 

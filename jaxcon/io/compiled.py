@@ -92,9 +92,17 @@ class Compiled:
                     raise ValueError(f"from_mjcf: the model's {field} must be numbers, got NaN.")
 
     def name(self, kind: str, i: int) -> str:
-        """Returns the name of object i of a kind such as "joint"; "joint 3" if it has no name."""
+        """Returns the name of object i of a kind such as "joint"; "joint 3" if it has no name.
+
+        If another object of the kind is named "joint 3", the result is "joint 3 (unnamed)".
+        """
         code = getattr(self.mujoco.mjtObj, f"mjOBJ_{kind.upper()}")
-        return self.mujoco.mj_id2name(self.model, code, i) or f"{kind} {i}"
+        if name := self.mujoco.mj_id2name(self.model, code, i):
+            return name
+        name = f"{kind} {i}"
+        while self.mujoco.mj_name2id(self.model, code, name) >= 0:
+            name += " (unnamed)"
+        return name
 
     def choice(self, enum: str, value: int | np.integer) -> str:
         """Returns the name of a value of a MuJoCo enumeration, such as "hinge" for mjtJoint 3."""
@@ -125,13 +133,16 @@ class Names:
     Attributes:
         taken: the names in the scene.
         given: the name in the scene by the wanted name and the kind of the object.
+        touching: MuJoCo's ids of the bodies on both sides of each contact, by the name in the
+            scene.
     """
 
     def __init__(self) -> None:
         self.taken = {"world", "gravity"}
         self.given: dict[tuple[str, str], str] = {}
+        self.touching: dict[str, tuple[int, int]] = {}
 
-    def take(self, name: str, kind: str) -> str:
+    def take(self, name: str, kind: str, key: str | None = None) -> str:
         """Reserves a unique name and returns it.
 
         If the wanted name is taken, the kind is appended, and then a number if necessary.
@@ -139,12 +150,13 @@ class Names:
         Args:
             name: the wanted name.
             kind: the kind of the object, such as "joint".
+            key: the kind in `given`, if objects of one kind may want the same name.
         """
         free, n = name, 1
         while free in self.taken:
             free, n = f"{name} {kind}" + f" {n}" * (n > 1), n + 1
         self.taken.add(free)
-        self.given.setdefault((name, kind), free)
+        self.given.setdefault((name, key or kind), free)
         return free
 
 

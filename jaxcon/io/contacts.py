@@ -26,24 +26,36 @@ DIRECTIONS = 500
 def contacts(
     compiled: Compiled, links: tuple[Link, ...], names: Names
 ) -> Iterator[PlaneContact | CapsuleContact | ShapeContact]:
-    """Yields the contacts of all supported pairs of geoms."""
+    """Yields the contacts of all supported pairs of geoms, and notes their bodies in `names`."""
     for pair in pairs.pairs(compiled):
         if not pairs.supported(compiled, pair):
             continue
-        ends = [scene_body(compiled, links, int(compiled.model.geom_bodyid[g])) for g in pair[:2]]
-        first, second = pairs.shapes(compiled, pair)
-        if first == "plane" and second in pairs.ON_PLANE:
-            yield from _on_plane(compiled, pair, ends, names)
-        elif {first, second} <= set(pairs.ROUND):
-            yield from _round(compiled, pair, ends, names)
-        else:
-            yield _of_shapes(compiled, pair, ends, names)
+        first, second = (int(compiled.model.geom_bodyid[g]) for g in pair[:2])
+        ends = [scene_body(compiled, links, body) for body in (first, second)]
+        for element in _of_pair(compiled, pair, ends, names):
+            names.touching[element.name] = first, second
+            yield element
 
 
-def _of_shapes(compiled: Compiled, pair: GeomPair, ends: list[str], names: Names) -> ShapeContact:
-    """Returns the contact of two other shapes."""
+def _of_pair(
+    compiled: Compiled, pair: GeomPair, ends: list[str], names: Names
+) -> Iterator[PlaneContact | CapsuleContact | ShapeContact]:
+    """Yields the contacts of a supported pair of geoms."""
+    first, second = pairs.shapes(compiled, pair)
+    if first == "plane" and second in pairs.ON_PLANE:
+        yield from _on_plane(compiled, pair, ends, names)
+    elif {first, second} <= set(pairs.ROUND):
+        yield from _round(compiled, pair, ends, names)
+    else:
+        yield from _of_shapes(compiled, pair, ends, names)
+
+
+def _of_shapes(
+    compiled: Compiled, pair: GeomPair, ends: list[str], names: Names
+) -> Iterator[ShapeContact]:
+    """Yields the contact of two other shapes."""
     first, second = (_shape(compiled, geom) for geom in pair[:2])
-    return ShapeContact(
+    yield ShapeContact(
         names.take(pairs.label(compiled, pair), "contact"),
         ends[0],
         ends[1],

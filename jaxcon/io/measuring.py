@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -39,13 +40,13 @@ class Objects:
 
 @pytree
 class Parts:
-    """Bodies of MuJoCo that are merged with others into a link, k of them.
+    """Bodies of MuJoCo that are merged with others into a link or fixed to the world, k of them.
 
     Attributes:
         mass: (k,) [kg].
         center: the center of mass in the frame of the link, (k, 3) [m].
         inertia: the inertia about the center of mass in the frame of the link, (k, 3, 3) [kg m²].
-        links: the name of the link of each body.
+        links: the name of the link of each body; `jc.WORLD` for bodies that do not move.
     """
 
     mass: Array
@@ -113,7 +114,7 @@ class Reading:
     Attributes:
         system: the system, with the turns of the state.
         tree: the kinematic tree.
-        parts: the bodies of links with several bodies.
+        parts: the bodies of links with several bodies, and the bodies that do not move.
         state: the state.
         info: accelerations and multipliers; None if they are not known.
         control: the control inputs; None if they are not known.
@@ -204,7 +205,7 @@ class Reading:
 
     @cached_property
     def solids(self) -> Solids:
-        """The links, followed by the bodies of links with several bodies."""
+        """The links, followed by the bodies of `parts`."""
         (inertia,) = self.system.inertia
         position, _, rotation, velocity, spin = (x[1:] for x in self.centers)
         arm, at = self.arms(self.parts.links, self.parts.center)
@@ -215,6 +216,12 @@ class Reading:
             jnp.concatenate([velocity, self.centers.velocity[at] + jnp.cross(turning, arm)]),
             jnp.concatenate([_turned(self.tensors[0], spin), _turned(self.tensors[1], turning)]),
         )
+
+    @property
+    def fixed_moment(self) -> Array:
+        """The sum Σ m c over the bodies that do not move, (3,) [kg m]; c are centers of mass."""
+        fixed = np.flatnonzero(self.index(self.parts.links) == 0)
+        return self.parts.mass[fixed] @ self.parts.center[fixed]
 
     @cached_property
     def tensors(self) -> tuple[Array, Array]:
@@ -277,15 +284,23 @@ class Reading:
         return jnp.ones_like(self.state.time)
 
     @cached_property
-    def actuators(self) -> dict[str, tuple[Array, Array, Array]]:
-        """Coordinate θ, rate θ̇ and force along θ of each actuator, by the name of the element."""
+    def actuators(self) -> dict[str, tuple[Array, Array, Array, Array]]:
+        """Coordinate θ, rate θ̇, force along l = g θ and gear g of each actuator, by element name.
+
+        The force of a `Motor` is its control input.
+        """
         found = {}
         for group in self.system.forces:
             if not isinstance(group, JointForces) or not group.starts:
                 continue
             row = group.coordinate.read(self.snapshot)
-            force = group.along(row, self.control)
-            lanes = [jnp.broadcast_to(x, (len(group.names),)) for x in (row.value, row.rate, force)]
+            gear = jnp.asarray(group.params.get("gear", 1.0), self.state.q.dtype)
+            # at the coordinate l = g θ the gear is one; a division by g fails for g = 0
+            direct = dataclasses.replace(group, params={**group.params, "gear": 1.0})
+            geared = row._replace(value=gear * row.value, rate=gear * row.rate)
+            force = direct.along(geared, self.control)
+            numbers = row.value, row.rate, force, gear
+            lanes = [jnp.broadcast_to(x, (len(group.names),)) for x in numbers]
             found |= {name: tuple(x[i] for x in lanes) for i, name in enumerate(group.names)}
         return found
 

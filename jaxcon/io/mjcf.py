@@ -249,10 +249,12 @@ class MujocoModel:
                 sensors need none.
             control: the control of the system, (nu,); by default the control of the info.
             names: the sensors to read, in the order of the result; by default all. Sensors without
-                a name are called "sensor 0" and so on.
+                a name are called "sensor 0" and so on, or "sensor 0 (unnamed)" if another sensor
+                has this name. `readings.supported` are the names of all supported sensors.
 
         Raises:
-            ValueError: a name is unknown, or a sensor needs an info or the control.
+            ValueError: a name is unknown, `names` is a str, or a sensor needs an info or the
+                control.
             NotImplementedError: a sensor is not supported; the message names it.
         """
         chosen = self.readings.chosen(names)

@@ -158,7 +158,7 @@ def _limit(compiled: Compiled, joint: LinkJoint, at: Coordinate, names: Names) -
         return
     inward = m.jnt_margin[joint.id] * np.array([1.0, -1.0])
     lower, upper = m.jnt_range[joint.id] - m.qpos0[joint.q] + inward
-    name = names.take(f"{compiled.name('joint', joint.id)} limit", "limit")
+    name = names.take(f"{compiled.name('joint', joint.id)} limit", "limit", "joint limit")
     yield Limit(name, at.joint, lower, upper, at.name)
 
 
@@ -172,7 +172,7 @@ def _ball_limit(
     name = names.take(f"{label} angle", "angle")
     yield RotationAngle(name, link.above, link.name, compiled.data.xanchor[joint.id])
     upper = m.jnt_range[joint.id].max() - m.jnt_margin[joint.id]
-    yield Limit(names.take(f"{label} limit", "limit"), name, upper=upper)
+    yield Limit(names.take(f"{label} limit", "limit", "joint limit"), name, upper=upper)
 
 
 def _freedoms(

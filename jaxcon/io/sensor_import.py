@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import re
+import copy
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from typing import Any
 
 import jax.numpy as jnp
@@ -31,6 +32,7 @@ from jaxcon.io.sensors import (
     Sensors,
 )
 from jaxcon.io.tendons import unsupported
+from jaxcon.system.actuators import Motor
 from jaxcon.system.body_system import BodySystem
 from jaxcon.system.layout import WORLD
 
@@ -56,7 +58,10 @@ class Importer:
     ) -> None:
         self.compiled, self.links, self.names = compiled, links, names
         self.transmissions, self.system = transmissions, system
+        # bodies by link: those of links with several bodies, and those fixed to the world
         self.merged = [(link, b) for link in links if len(link.members) > 1 for b in link.members]
+        moving = {b for link in links for b in link.members}
+        self.merged += [(None, b) for b in range(1, compiled.model.nbody) if b not in moving]
 
     def cast(self, x: np.ndarray) -> Array:
         """Converts numbers to a JAX array in the dtype of the system."""
@@ -93,10 +98,18 @@ class Importer:
             why = "is on a body that does not move, which is not supported"
         elif kind == "jointactfrc" and m.jnt_actgravcomp.any():
             why = "is in a model with actuatorgravcomp, which is not supported"
-        elif kind == "actuatorfrc" and not self.transmissions[int(m.sensor_objid[i])].gear:
-            why = "is of an actuator with a gear of zero, which is not supported"
+        elif kind == "actuatorfrc" and self._limits_joint(int(m.sensor_objid[i])):
+            # the force range of the element includes the range of the joint
+            why = (
+                "is of an actuator on a joint with an actuatorfrcrange, which is not supported;"
+                " use a sensor jointactuatorfrc"
+            )
         elif kind.startswith("tendon") and (why := self._missing(int(m.sensor_objid[i]))):
             pass
+        elif kind in OF_LIMITS and self._ignored_limit(kind, int(m.sensor_objid[i])):
+            why = "is of a limit that is left out by `ignore`"
+        elif kind == "touch" and int(m.site_bodyid[m.sensor_objid[i]]) in self._untouched:
+            why = "is on a body with contacts that are left out by `ignore`"
         elif kind == "touch" and self._zone(int(m.sensor_objid[i])) not in zones.SHAPES:
             why = f"has a zone that is not one of {list(zones.SHAPES)}"
         return Entry(name, kind, int(m.sensor_adr[i]), int(m.sensor_dim[i]), why)
@@ -106,6 +119,40 @@ class Importer:
         found = self.names.given.get((self.compiled.name("tendon", tendon), "tendon"))
         why = unsupported(self.compiled, self.links, tendon)
         return "" if found else f"is of a tendon that {why}"
+
+    def _limits_joint(self, actuator: int) -> bool:
+        """Returns True if an actuator acts on a joint that limits the forces of its actuators."""
+        m = self.compiled.model
+        on_joint = self.compiled.choice("mjtTrn", m.actuator_trntype[actuator]).startswith("joint")
+        return on_joint and bool(m.jnt_actfrclimited[m.actuator_trnid[actuator, 0]])
+
+    def _limit(self, kind: str, i: int) -> str:
+        """Returns the name of the element that limits a joint or tendon; empty without one."""
+        what = "joint" if kind.startswith("joint") else "tendon"
+        key = f"{self.compiled.name(what, i)} limit", f"{what} limit"
+        return self.names.given.get(key, "")
+
+    def _ignored_limit(self, kind: str, i: int) -> bool:
+        """Returns True if the user left out the limit of a joint or tendon."""
+        m, features = self.compiled.model, {"limit"}
+        if kind.startswith("joint"):
+            limited = m.jnt_limited[i]
+            ball = self.compiled.choice("mjtJoint", m.jnt_type[i]) == "ball"
+            features |= {"ball_limit"} if ball else set()
+        else:
+            limited = m.tendon_limited[i]
+            features |= {"tendon"}
+        missing = bool(limited) and not self._limit(kind, i)
+        return missing and not features.isdisjoint(self.compiled.ignored)
+
+    @cached_property
+    def _untouched(self) -> set[int]:
+        """MuJoCo's ids of the bodies with contacts that the user left out."""
+        c, everything = self.compiled, copy.copy(self.compiled)
+        everything.ignored = frozenset()
+        kept = {pair[:2] for pair in pairs.pairs(c) if pairs.supported(c, pair)}
+        missing = {pair[:2] for pair in pairs.pairs(everything)} - kept
+        return {int(c.model.geom_bodyid[geom]) for pair in missing for geom in pair}
 
     def _zone(self, site: int) -> str:
         """Returns the shape of a site, such as "sphere"."""
@@ -161,27 +208,24 @@ class Importer:
             more["elements"] = tuple(names.given[label, "actuator"] for label in labels)
             for field in ("gear", "reference", "measured"):
                 own[field] = np.array([float(getattr(x, field)) for x in chosen])
+            own["gain"] = np.array([self._gain(i) for i in ids])
         if kind in OF_TENDONS:
             own["reference"] = m.tendon_length0[ids]
             labels = [self.compiled.name("tendon", i) for i in ids]
             more["elements"] = tuple(names.given[label, "tendon"] for label in labels)
         if kind == "tendonactfrc":
-            acting = [i for i, x in enumerate(m.actuator_trntype) if self._pulls(i, x)]
+            targets = [self.compiled.choice("mjtTrn", x) for x in m.actuator_trntype]
+            acting = [i for i, x in enumerate(targets) if x == "tendon"]
             labels = [self.compiled.name("actuator", i) for i in acting]
             more["elements"] = tuple(names.given[label, "actuator"] for label in labels)
-            gears = [self.transmissions[i].gear for i in acting]
             own["acting"] = np.array(
-                [
-                    [(m.actuator_trnid[i, 0] == t) / g for i, g in zip(acting, gears, strict=True)]
-                    for t in ids
-                ]
+                [[self._gain(i) * (m.actuator_trnid[i, 0] == t) for i in acting] for t in ids]
             ).reshape(len(ids), len(acting))
         if kind in OF_LIMITS:
-            what = "joint" if kind.startswith("joint") else "tendon"
-            labels = [f"{self.compiled.name(what, j)} limit" for j in ids]
-            more["elements"] = tuple(names.given.get((label, "limit"), "") for label in labels)
+            more["elements"] = tuple(self._limit(kind, j) for j in ids)
         if kind in OF_SUBTREES:
             own["bodies"] = np.array([self._below(body) for body in ids])
+            own["first"] = np.array([self._first(body) for body in ids])
         if kind in ("force", "torque"):
             bodies = [int(m.site_bodyid[i]) for i in ids]
             own["bodies"] = np.array([self._below(body) for body in bodies])
@@ -202,10 +246,14 @@ class Importer:
             **more,
         )
 
-    def _pulls(self, i: int, kind: int) -> bool:
-        """Returns True if actuator i with this type of transmission pulls a tendon."""
-        on_tendon = self.compiled.choice("mjtTrn", kind) == "tendon"
-        return on_tendon and self.transmissions[i].gear != 0
+    def _gain(self, i: int) -> float:
+        """Returns the factor from the force of the element of actuator i to MuJoCo's force.
+
+        A `Motor` has the product of gear and gain as its gear; the factor is then the gain.
+        """
+        name = self.names.given[self.compiled.name("actuator", i), "actuator"]
+        motor = any(name in group.names and group.law is Motor for group in self.system.forces)
+        return float(self.compiled.model.actuator_gainprm[i, 0]) if motor else 1.0
 
     def _objects(self, kinds: Sequence[int], ids: list[int]) -> Objects:
         """Returns frames as `Objects`."""
@@ -214,17 +262,19 @@ class Importer:
         return Objects(self.cast(np.array(positions)), self.cast(np.array(turns)), tuple(links))
 
     def _parts(self) -> Parts:
-        """Returns the bodies of links with several bodies."""
+        """Returns the bodies of links with several bodies, and the bodies that do not move."""
         m, data = self.compiled.model, self.compiled.data
         centers, tensors = np.zeros((len(self.merged), 3)), np.zeros((len(self.merged), 3, 3))
         for i, (link, body) in enumerate(self.merged):
-            frame = data.xmat[link.body].reshape(3, 3)
+            body_of_link = 0 if link is None else link.body  # MuJoCo's body 0 is the world
+            frame = data.xmat[body_of_link].reshape(3, 3)
             axes = frame.T @ data.ximat[body].reshape(3, 3)
-            centers[i] = frame.T @ (data.xipos[body] - data.xpos[link.body])
+            centers[i] = frame.T @ (data.xipos[body] - data.xpos[body_of_link])
             tensors[i] = axes @ np.diag(m.body_inertia[body]) @ axes.T
         masses = m.body_mass[[body for _, body in self.merged]]
         numbers = map(self.cast, (masses, centers, tensors))
-        return Parts(*numbers, links=tuple(link.name for link, _ in self.merged))
+        names = tuple(WORLD if link is None else link.name for link, _ in self.merged)
+        return Parts(*numbers, links=names)
 
     def _subtree(self, body: int) -> set[int]:
         """Returns MuJoCo's ids of a body and of all bodies below it."""
@@ -241,25 +291,26 @@ class Importer:
         below, order = self._subtree(body), self.system.layout.groups[0].names
         by_name = {link.name: link for link in self.links}
         whole = [below.issuperset(by_name[name].members) for name in order]
-        parts = [b in below and not below.issuperset(link.members) for link, b in self.merged]
+        parts = [
+            b in below and (link is None or not below.issuperset(link.members))
+            for link, b in self.merged
+        ]
         return np.array([*whole, *parts], float)
+
+    def _first(self, body: int) -> np.ndarray:
+        """Returns a mask of the part that is a body, (links + parts,); zeros for a whole link."""
+        links = len(self.system.layout.groups[0].names)
+        return np.array([0.0] * links + [float(b == body) for _, b in self.merged])
 
     def _owners(self) -> dict[str, tuple[int, int]]:
         """Returns MuJoCo's bodies on both sides of each contact, connect and weld, by element."""
-        m, owners = self.compiled.model, {}
-        given = {w: name for (w, kind), name in self.names.given.items() if kind == "contact"}
-        for pair in pairs.pairs(self.compiled):
-            label = pairs.label(self.compiled, pair)
-            ends = tuple(int(m.geom_bodyid[g]) for g in pair[:2])
-            for wanted, name in given.items():
-                if re.fullmatch(re.escape(label) + r"( \d+)?", wanted):
-                    owners[name] = ends
+        m, owners = self.compiled.model, dict(self.names.touching)
         for i in range(m.neq):
             name = self.names.given.get((self.compiled.name("equality", i), "equality"))
             if self.compiled.choice("mjtEq", m.eq_type[i]) in ("connect", "weld") and name:
                 ends = int(m.eq_obj1id[i]), int(m.eq_obj2id[i])
                 if m.eq_objtype[i] == int(self.compiled.mujoco.mjtObj.mjOBJ_SITE):
-                    ends = tuple(int(m.site_bodyid[s]) for s in ends)
+                    ends = int(m.site_bodyid[ends[0]]), int(m.site_bodyid[ends[1]])
                 owners[name] = ends
         return owners
 

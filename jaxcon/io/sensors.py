@@ -113,7 +113,7 @@ class Sensors:
 
     Attributes:
         groups: the supported sensors by kind.
-        parts: the bodies of links with several bodies.
+        parts: the bodies of links with several bodies, and the bodies that do not move.
         magnetic: the magnetic flux, (3,) [T].
         entries: all sensors, in MuJoCo's order.
     """
@@ -123,14 +123,24 @@ class Sensors:
     magnetic: Array
     entries: tuple[Entry, ...] = static()
 
+    @property
+    def supported(self) -> tuple[str, ...]:
+        """The names of the supported sensors."""
+        return tuple(entry.name for entry in self.entries if not entry.why)
+
     def chosen(self, names: Sequence[str] | None) -> tuple[Entry, ...]:
         """Returns the sensors of these names, or all sensors.
 
         Raises:
-            ValueError: a name is unknown.
+            ValueError: a name is unknown, or `names` is a str.
         """
         if names is None:
             return self.entries
+        if isinstance(names, str):
+            raise ValueError(
+                f"sensors: names must be a sequence of names, got the str '{names}'; pass"
+                f" names=('{names}',)."
+            )
         known = {entry.name: entry for entry in self.entries}
         for name in names:
             if name not in known:
@@ -148,7 +158,7 @@ class Sensors:
             if entry.why:
                 raise NotImplementedError(
                     f"sensors: '{entry.name}' of type {entry.kind} {entry.why}; read other sensors"
-                    " by names=(…), see `sensor_slices`."
+                    f" with names=(…). {_offer(self.supported)}"
                 )
         for entry in chosen:
             owner = f"sensors: '{entry.name}' of type {entry.kind}"
@@ -168,17 +178,26 @@ class Sensors:
             start: the model at the state of the info, for the kinds `OF_INFO`.
             chosen: the sensors.
         """
-        values: dict[str, Array] = {}
+        values: dict[Entry, Array] = {}
         for group in self.groups:
-            if not {entry.name for entry in group.entries} & {entry.name for entry in chosen}:
+            if not set(group.entries) & set(chosen):
                 continue
             found = READERS[group.kind](self, start if group.kind in OF_INFO else here, group)
             cut = group.numbers["cutoff"][:, None]
             lowest = jnp.where(np.array(group.positive)[:, None], -jnp.inf, -cut)
             found = jnp.where(cut > 0, jnp.clip(found, lowest, cut), found)
-            values |= {entry.name: x for entry, x in zip(group.entries, found, strict=True)}
+            values |= dict(zip(group.entries, found, strict=True))
         dtype = here.state.q.dtype
-        return jnp.concatenate([jnp.zeros(0, dtype), *(values[x.name] for x in chosen)])
+        return jnp.concatenate([jnp.zeros(0, dtype), *(values[x] for x in chosen)])
+
+
+def _offer(names: tuple[str, ...]) -> str:
+    """Returns a sentence of an error message that names the supported sensors."""
+    if not names:
+        return "No sensor of the model is supported."
+    some = ", ".join(f"'{name}'" for name in names[:6])
+    more = ", …" if len(names) > 6 else ""
+    return f"Supported are model.readings.supported: {some}{more}."
 
 
 Reader = Callable[[Sensors, Reading, SensorGroup], Array]
@@ -287,12 +306,14 @@ def of_joints(sensors: Sensors, reading: Reading, group: SensorGroup) -> Array:
 def of_actuators(sensors: Sensors, reading: Reading, group: SensorGroup) -> Array:
     """Reads lengths, velocities and forces of actuators."""
     found = [reading.actuators[name] for name in group.elements]
-    value, rate, force = (jnp.stack(x) for x in zip(*found, strict=True))
-    gear = group.numbers["gear"]
+    value, rate, force, gear = (jnp.stack(x) for x in zip(*found, strict=True))
+    # the gear of a Motor is MuJoCo's gear times the gain
+    gain = group.numbers["gain"]
+    gear = jnp.where(gain == 0, group.numbers["gear"], numerics.safe_divide(gear, gain))
     x = {
         "actuatorpos": group.numbers["measured"] * gear * (value + group.numbers["reference"]),
         "actuatorvel": gear * rate,
-        "actuatorfrc": numerics.safe_divide(force, gear),
+        "actuatorfrc": gain * force,
     }
     return x[group.kind][:, None]
 
@@ -322,8 +343,11 @@ def of_subtrees(sensors: Sensors, reading: Reading, group: SensorGroup) -> Array
     """Reads centers of mass, their velocities and angular momenta about them, of subtrees."""
     mass, position, velocity, momentum = reading.solids
     terms = group.numbers["bodies"] * mass[None]
-    share = terms / jnp.sum(terms, axis=1, keepdims=True)
-    center, speed = share @ position, share @ velocity
+    total = jnp.sum(terms, axis=1, keepdims=True)
+    share = numerics.safe_divide(terms, total)
+    # MuJoCo's center of a subtree without mass is that of its first body; its velocity is zero
+    center = jnp.where(total > 0, share, group.numbers["first"]) @ position
+    speed = share @ velocity
     if group.kind != "subtreeangmom":
         return center if group.kind == "subtreecom" else speed
     arm, relative = position[None] - center[:, None], velocity[None] - speed[:, None]
@@ -342,6 +366,7 @@ def of_the_world(sensors: Sensors, reading: Reading, group: SensorGroup) -> Arra
         springs = tuple(x for x in system.forces if x.law is not Force)
         system = dataclasses.replace(system, forces=springs)
         x = system.energy(state.q, state.v, state.instant).potential
+        x = x - reading.fixed_moment @ system.gravity
     return jnp.broadcast_to(x, (len(group.entries), 1))
 
 

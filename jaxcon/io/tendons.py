@@ -275,4 +275,5 @@ def passive_tendons(
         if limited:
             inward = m.tendon_margin[t] * np.array([1.0, -1.0])
             lower, upper = m.tendon_range[t] - length + inward
-            yield Limit(names.take(f"{label} limit", "limit"), at.joint, lower, upper)
+            name = names.take(f"{label} limit", "limit", "tendon limit")
+            yield Limit(name, at.joint, lower, upper)
