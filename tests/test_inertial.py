@@ -167,7 +167,8 @@ def contacts_scene():
     can, hull = jc.shapes.Cylinder(0.3, 0.8, **place), jc.shapes.Hull(points)
     brick = jc.shapes.Box((0.3, 0.4, 0.5), points[5])
     plane = jc.shapes.Plane((0.2, 0.1, 1.0), points[0])
-    for i, shapes in enumerate(((can, brick), (plane, hull), (brick, plane))):
+    pin = jc.shapes.Capsule(0.1, 0.4, points[3])
+    for i, shapes in enumerate(((can, pin), (plane, hull), (brick, plane))):
         scene.add(jc.contacts.ShapeContact(f"shapes {i}", "first", "third", *shapes))
     scene.add(
         jc.contacts.Rope(
