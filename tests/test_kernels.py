@@ -674,7 +674,7 @@ def test_rows_of_long_loops_lie_in_local_arrays(worlds, long, monkeypatch):
     for limit in ("MAX_UNROLLED", "MAX_UNROLLED_HELD", "MAX_ITERATED", "MAX_HELD", "MAX_CHOSEN"):
         monkeypatch.setattr(entries, limit, 0)
     if long:
-        monkeypatch.setattr(cpu, "LONG", 0)
+        monkeypatch.setattr(cpu, "LONG", range(10**9))
 
     def function(x):
         turn = lambda c, _: (through_rows(c)[2][None] + c, None)  # noqa: E731
@@ -707,7 +707,7 @@ def check_operations(platform, function, args):
 def test_worlds_take_their_own_branches_and_rounds(platform, function, worlds, long, monkeypatch):
     """With long programs, four groups of lanes evaluate each piece of a kernel in turn."""
     if long:
-        monkeypatch.setattr(cpu, "LONG", 0)
+        monkeypatch.setattr(cpu, "LONG", range(10**9))
         monkeypatch.setattr(entries, "MAX_UNROLLED", 0)
     random = np.random.default_rng(worlds)
     count = len(inspect.signature(function).parameters)
@@ -726,7 +726,7 @@ def test_worlds_take_their_own_branches_and_rounds(platform, function, worlds, l
 def test_worlds_that_two_groups_of_lanes_have_step_once(worlds, long, monkeypatch):
     """A kernel on a CPU writes its results in place of its arguments."""
     if long:
-        monkeypatch.setattr(cpu, "LONG", 0)
+        monkeypatch.setattr(cpu, "LONG", range(10**9))
     with jax.enable_x64(True):
         system, states = batch("four-bar", np.float64, worlds)
 
