@@ -341,8 +341,8 @@ def from_mjcf(
             "contact": all contacts,
             "self_contact": contacts between two moving bodies,
             "shape": contacts between unsupported shapes,
-            "mocap": motions of mocap bodies, which are held at their pose in the model; mpos and
-                mquat of keyframes are not used,
+            "mocap": motions of mocap bodies, which are held at their pose in the model,
+            not at mpos and mquat of keyframes,
             "torsion": torsional and rolling friction (condim 4 or 6),
             "limit": all limits of joints and tendons,
             "ball_limit": limits of ball joints,
