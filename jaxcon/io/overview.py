@@ -16,11 +16,11 @@ from jaxcon.io.mjcf import MujocoModel, from_mjcf
 
 @dataclass(frozen=True)
 class Overview:
-    """What is read from a model.
+    """The contents of a model, and why it is refused if it is.
 
     Attributes:
         title: the name of the model.
-        rows: pairs of a subject and what the model has of it; see `summary.table`.
+        rows: pairs of a subject and a description; see `summary.table`.
         refused: the reasons why the model cannot be read; empty if it was read.
         model: the model; None if it is refused.
     """

@@ -213,13 +213,9 @@ class _Places:
     def _instruction(self, instruction: Instruction) -> None:
         self._position += 1
         for x in instruction.operands:
-            if instruction.name != "fetch":
-                self._use(x)
-        if instruction.name == "fetch":  # the only one that writes its register
+            self._use(x)
+        if instruction.name in WRITES:
             register: Any = instruction.operands[0]
-            self._made[register.number] = self._position, self._piece
-        elif instruction.name in WRITES:
-            register = instruction.operands[0]
             self._shared[register.number] = register
         elif instruction.result is not None:
             self._made[instruction.result.number] = self._position, self._piece
@@ -493,10 +489,9 @@ class _Writer:
         """Writes the instructions of a piece."""
         for instruction in instructions:
             match instruction:
-                case Instruction("load", Register() as result, address=Address() as address):
-                    self._load(result, address)
-                    self._keep(result, f"%v{result.number}")
-                case Instruction("fetch", _, (Register() as result,), address=Address() as address):
+                case Instruction(
+                    "load" | "fetch", Register() as result, address=Address() as address
+                ):
                     self._load(result, address)
                     self._keep(result, f"%v{result.number}")
                 case Instruction("store", _, (x,), address=Address() as address):

@@ -30,7 +30,7 @@ MAX_REGISTERS = 1_000_000
 DTYPES = {np.dtype(x) for x in ("float32", "float64", "int32", "int64", "uint32", "uint64", "bool")}
 """The dtypes of registers."""
 
-WRITES = ("set", "assign", "fetch")
+WRITES = ("set", "assign")
 """Instructions that write their first operand."""
 
 COMPARISONS = ("eq", "ne", "lt", "le", "gt", "ge")
@@ -110,8 +110,8 @@ class Instruction(NamedTuple):
             the dtype of the result; `select` (predicate, if true, if false); `load` and `store`;
             `set` and `assign`, which write the second operand to the first one, a register. Threads
             that do not take part in a branch or in a round keep the register after `assign`, and
-            may lose it after `set`. `fetch` reads a local array into its first operand. Unlike
-            `load`, it keeps its place after all that is written before.
+            may lose it after `set`. `fetch` reads a local array. Unlike `load`, it keeps its place
+            after all that is written before.
         result: the register of its result, which no other instruction writes; None if the
             instruction must be kept.
         operands: its operands.
@@ -124,6 +124,11 @@ class Instruction(NamedTuple):
     operands: tuple[Scalar, ...]
     reads: tuple[int, ...]
     address: Address | None = None
+
+    @property
+    def keeps_place(self) -> bool:
+        """True for what is written to memory or to registers, and for reads of local arrays."""
+        return self.result is None or self.name == "fetch"
 
 
 class Branch(NamedTuple):
@@ -263,7 +268,7 @@ class Thread:
     def fetch(self, address: Address, dtype: Any) -> Register:
         """Reads a number from a local array, after all that was written to it before."""
         result = self.new(dtype)
-        self._append(Instruction("fetch", None, (result,), (), address))
+        self._append(Instruction("fetch", result, (), (), address))
         return result
 
     def store(self, address: Address, x: Scalar) -> None:
@@ -540,14 +545,14 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
     """Returns a block in which each instruction is followed by its first reader, if possible.
 
     Operands that need more registers come first. What is written to memory, or to registers that
-    are written again, keeps its place, after all that is read before.
+    are written again, keeps its place, after all that is read before. So do reads of local arrays.
 
     Reference: Sethi and Ullman, The Generation of Optimal Code for Arithmetic Expressions (1970).
     """
     free: dict[int, Instruction] = {}  # instructions that have no place yet, by their result
     needs: dict[int, int] = {}  # the number of registers that each of them needs
     for statement in statements:
-        if isinstance(statement, Instruction) and statement.result is not None:
+        if isinstance(statement, Instruction) and statement.result and not statement.keeps_place:
             below = sorted((needs.get(x, 0) for x in statement.reads), reverse=True)
             number = statement.result.number
             free[number] = statement
@@ -574,7 +579,7 @@ def _ordered(statements: Sequence[Statement]) -> list[Statement]:
             return "fetch" if statement.name == "fetch" else "write"
         return "block"
 
-    kept = (x for x in statements if not isinstance(x, Instruction) or x.result is None)
+    kept = (x for x in statements if not isinstance(x, Instruction) or x.keeps_place)
     for what, group in itertools.groupby(kept, kind):
         roots: list[Any] = list(group)
         if what != "block":  # later writes of a group do not depend on earlier ones

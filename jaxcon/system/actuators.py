@@ -172,13 +172,17 @@ class DeadBandSpring(JointForce):
             value: θ.
             rate: θ̇.
         """
-        beyond = value - jnp.clip(value, p["lower"], p["upper"])
-        return -p["stiffness"] * beyond - p["damping"] * rate
+        return -p["stiffness"] * _beyond(p, value) - p["damping"] * rate
 
     @staticmethod
     def potential(p: dict[str, Any], value: Lane) -> Lane:
         """Returns the energy ½ k (θ − clip(θ, lower, upper))² at the coordinate θ [J]."""
-        return p["stiffness"] * (value - jnp.clip(value, p["lower"], p["upper"])) ** 2 / 2
+        return p["stiffness"] * _beyond(p, value) ** 2 / 2
+
+
+def _beyond(p: dict[str, Any], value: Lane) -> Lane:
+    """Returns how far θ lies beyond the dead band, θ − clip(θ, lower, upper)."""
+    return value - jnp.clip(value, p["lower"], p["upper"])
 
 
 @dataclass(frozen=True)
